@@ -103,6 +103,8 @@ SUPPORTED = {
     "a chain of transforms": lambda c: jax.lax.associative_scan(jnp.matmul, BATCH * c[0])[-1, 0, :1] * c / 99,
     "sums over several axes": lambda c: jnp.sum(EIGHTS[:, :, :, None] * c[0], (0, 2, 3))[:, 0] * c / 99,
     "4095 numbers": lambda c: c / 2 + jnp.sum(jnp.sin(jnp.arange(4095.0) * c[0])) / 9999,
+    "4096 numbers": lambda c: c / 2 + jnp.sum(jnp.sin(jnp.arange(4096.0) * c[0])) / 9999,
+    "a product of 4096": lambda c: c / 2 + jnp.arange(4096.0) @ jnp.sin(jnp.arange(4096.0) * c[0]) / 1e8,
     "cube roots": lambda c: jnp.cbrt(c) / 2,
     "small products and sums": lambda c: jnp.outer(c, c) @ c / 9 + jnp.sum(c) / 9 + jnp.cumsum(c) / 9,
     "special functions": lambda c: c / 2 + sum(getattr(jax.lax, f)(jnp.tanh(c) / 2) for f in SPECIAL) / 99,
@@ -128,8 +130,8 @@ UNSUPPORTED = {
     "fft": lambda c: jnp.abs(jnp.fft.fft(c)) / 9,
     "callback": lambda c: jax.pure_callback(np.sin, jax.ShapeDtypeStruct(c.shape, c.dtype), c),
     "dot_general": lambda c: jnp.sum(jnp.ones((40, 40)) @ jnp.ones((40, 40)) * c[0], 1)[:4] / 999,
-    "reduce": lambda c: c / 2 + jnp.sum(jnp.sin(jnp.arange(4096.0) * c[0])) / 9999,
-    "a product of 4096": lambda c: c / 2 + jnp.arange(4096.0) @ jnp.sin(jnp.arange(4096.0) * c[0]) / 1e8,
+    "an index of 4096": lambda c: c / 2 + jnp.argmax(jnp.sin(jnp.arange(4096.0) * c[0])) / 9999,
+    "4096 running sums": lambda c: c / 2 + jnp.cumsum(jnp.sin(jnp.arange(4096.0) * c[0]))[-1] / 9999,
 }
 
 
@@ -237,23 +239,28 @@ def test_forces_with_products_of_matrices_are_one_kernel():
         assert np.allclose(x, y, rtol=1e-11, atol=1e-13)
 
 
-SUMS = [  # shapes, and axes that are summed over: few terms of many results
+SUMS = [  # shapes, and axes that are summed over: few terms of many results, and many of few
     ((3000, 2), 1),
     ((2, 3000), 0),
     ((4, 700, 3), (0, 2)),
     ((1500, 3, 2), (1,)),
     ((3000, 8), 1),
+    ((10_001,), 0),
+    ((3, 5001), 1),
 ]
 
 
 @on_cpu
 @pytest.mark.compiled
-def test_sums_of_few_terms_are_written_out():
+def test_large_sums_are_written_in_parts():
     """In value, in slopes, and in batches."""
 
     def sums(p):
         arrays = [p * jnp.cos(jnp.arange(1.0 * np.prod(shape))).reshape(shape) for shape, _ in SUMS]
-        return [jnp.sum(x, axis=axes) for x, (_, axes) in zip(arrays, SUMS, strict=True)]
+        sums = [jnp.sum(x, axis=axes) for x, (_, axes) in zip(arrays, SUMS, strict=True)]
+        long = arrays[-2]
+        product = jnp.prod(1 + 1e-4 * long)
+        return [*sums, product, jnp.max(long), jnp.min(arrays[-1], axis=1), long @ jnp.sin(long), long[None] @ long]
 
     def all_of(cut):
         slope = lambda p: jax.jvp(sums, (p,), (p,))  # noqa: E731

@@ -194,7 +194,9 @@ def blocks_of(bands: Array) -> tuple[Array, Array, Array]:
     """(N, p, p) each: the blocks before, on and behind the diagonal, those at the end filled with the identity."""
     p, n = len(bands) // 2, bands.shape[1]
     num_blocks = -(-n // p)
-    bands = jnp.pad(bands, ((0, 0), (0, num_blocks * p - n))).at[p, n:].set(1)
+    unit = np.zeros((2 * p + 1, num_blocks * p - n))
+    unit[p] = 1
+    bands = jnp.concatenate([bands, unit.astype(bands.dtype)], axis=1)
     row, column = np.arange(p)[:, None], np.arange(p)[None, :]
     rows = bands.reshape(2 * p + 1, num_blocks, p)
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 LARGEST_SUM = 4095  # numbers of a sum; XLA hands larger ones to another library
 FEW_TERMS = 32  # of a sum over an axis, up to which it is written out where the array is large
+LARGE = {"reduce_sum", "reduce_prod", "reduce_max", "reduce_min"}  # that are written in parts where the array is large
 LARGEST_MATRIX = 4096  # elements of one that meets a vector
 # of a kernel with more, compiling takes longer than 20 s, or fails: on one core 3 s for 4,700, 7 s for 8,500, 18 s for
 # 13,900; gradients and branches take .2 to 1.2 ms an operation
@@ -108,7 +109,7 @@ def _count(jaxpr: Jaxpr, most: int, before: bool):
                 if name == "cond":
                     more, branches = 0, more + branches
                 number, in_branches = number + more, in_branches + branches
-        elif not (before and (name.startswith(REPLACED) or is_of_few_terms(eqn))) and (
+        elif not (before and (name.startswith(REPLACED) or is_large_reduction(eqn))) and (
             objection := _objection(eqn, name)
         ):
             raise _Objection(objection, eqn)
@@ -133,12 +134,12 @@ def _objection(eqn, name: str):
     return name
 
 
-def is_of_few_terms(eqn) -> bool:
-    """Whether it is a sum over a few numbers for each of many results, which is written out."""
-    if eqn.primitive.name != "reduce_sum" or not eqn.outvars[0].aval.ndim:
+def is_large_reduction(eqn) -> bool:
+    """Whether it is a sum, or the like, of so many numbers that for_kernel.py writes it in parts."""
+    if eqn.primitive.name not in LARGE:
         return False
-    x, found = eqn.invars[0].aval, eqn.outvars[0].aval
-    return x.size > LARGEST_SUM and 0 < x.size <= FEW_TERMS * found.size and np.issubdtype(x.dtype, np.floating)
+    x = eqn.invars[0].aval
+    return x.size > LARGEST_SUM and np.issubdtype(x.dtype, np.floating)
 
 
 def _is_usual(aval) -> bool:

@@ -27,7 +27,15 @@ from hhtjax.primitives.consistent import held_p
 from hhtjax.primitives.interpreter import lowered
 from hhtjax.primitives.kernel_primitive import of_jaxpr
 from hhtjax.primitives.kernels import PART, STAGED
-from hhtjax.xla.fit_for_kernel import DTYPES, is_of_few_terms, is_of_vector, lengths, verdict
+from hhtjax.xla.fit_for_kernel import (
+    DTYPES,
+    FEW_TERMS,
+    LARGEST_SUM,
+    is_large_reduction,
+    is_of_vector,
+    lengths,
+    verdict,
+)
 from hhtjax.xla.sines import sines
 
 if TYPE_CHECKING:
@@ -42,6 +50,12 @@ COMBINED = {"scatter": lambda before, given: given} | {
     f"scatter-{name}": getattr(lax, name) for name in ("add", "sub", "mul", "min", "max")
 }
 LEAST = 6  # operations of a stage that is a kernel; fewer are one fusion or two anyway
+REDUCTIONS = {  # what combines two numbers, and many
+    "reduce_sum": (lax.add, jnp.sum),
+    "reduce_prod": (lax.mul, jnp.prod),
+    "reduce_max": (lax.max, jnp.max),
+    "reduce_min": (lax.min, jnp.min),
+}
 LARGEST = 8192  # numbers of an array; XLA may divide the work on larger ones among threads
 IDLE = {"broadcast_in_dim"}  # what a branch may hold that has nothing to do
 MANY = 4  # values of a conditional: of fewer, a loop is no better
@@ -200,8 +214,10 @@ def _in_kernel(eqn: JaxprEqn, copier):
     avals = tuple(x.aval for x in eqn.invars)
     if name == "dot_general" and _is_to_write_out(eqn):
         return _product(avals, params["dimension_numbers"])
-    if name == "reduce_sum" and is_of_few_terms(eqn):
-        return _traced(partial(_sum_of_few, axes=params["axes"]), avals)
+    if is_large_reduction(eqn):
+        return _traced(partial(_reduced, name, axes=params["axes"]), avals)
+    if name == "dot_general" and _is_of_long_vectors(eqn):
+        return _traced(partial(_product_of_vectors, params["dimension_numbers"]), avals)
     if name in COMBINED and _is_of_few_windows(eqn):
         return _traced(partial(_scattered, COMBINED[name], params["dimension_numbers"]), avals)
     if name == "hhtjax_sines":
@@ -247,12 +263,31 @@ def _product(avals: tuple, dimension_numbers: tuple) -> ClosedJaxpr:
     return computed_once(_traced(product, avals))
 
 
-def _sum_of_few(x: Array, axes: tuple) -> Array:
-    """A sum over axes, term by term."""
+def _is_of_long_vectors(eqn) -> bool:
+    """A product of vectors, or a batch of them, that is too long a sum."""
+    return max(lengths(eqn)[1:]) == 1 and max(x.aval.size for x in eqn.invars) > LARGEST_SUM
+
+
+def _product_of_vectors(dimension_numbers: tuple, x: Array, y: Array) -> Array:
+    (over, batch) = dimension_numbers
+    aligned = []
+    for z, o, b in zip((x, y), over, batch, strict=True):
+        rest = [i for i in range(z.ndim) if i not in (*o, *b)]  # of length 1
+        aligned.append(lax.transpose(z, (*o, *b, *rest)).reshape([z.shape[i] for i in (*o, *b)]))
+    found = _reduced("reduce_sum", aligned[0] * aligned[1], tuple(range(len(over[0]))))
+    return found.reshape(*found.shape, *(1,) * (x.ndim + y.ndim - sum(z.ndim for z in aligned)))
+
+
+def _reduced(name: str, x: Array, axes: tuple) -> Array:
+    """A sum, or the like, of a large array: halves are added until it is small, or has so few terms that these are
+    written out."""
+    combine, reduction = REDUCTIONS[name]
     rest = [i for i in range(x.ndim) if i not in axes]
-    shape = [x.shape[i] for i in rest]
-    x = lax.transpose(x, (*axes, *rest)).reshape(-1, *shape)
-    return reduce(lax.add, list(x))
+    x = lax.transpose(x, (*axes, *rest)).reshape(-1, *(x.shape[i] for i in rest))
+    while x.size > LARGEST_SUM and len(x) > FEW_TERMS:
+        half = len(x) // 2
+        x = jnp.concatenate([combine(x[:half], x[half : 2 * half]), x[2 * half :]])
+    return reduction(x, axis=0) if x.size <= LARGEST_SUM else reduce(combine, list(x))
 
 
 # scatters
