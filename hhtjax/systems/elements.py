@@ -267,7 +267,7 @@ def _taken(name: str, tree: PyTree, nodes: np.ndarray) -> PyTree:
                 "first axis of all leaves is that of the nodes, counted from 0."
             )
         x = jnp.asarray(x)
-        rows = _at_nodes(nodes.ravel().tobytes(), x.shape[0])(x.reshape(x.shape[0], -1))
+        rows = _at_nodes(nodes.tobytes(), nodes.shape, x.shape[0])(x.reshape(x.shape[0], -1))
         return rows.reshape(*nodes.shape, *x.shape[1:])
 
     return jax.tree.map(take, tree)
@@ -296,24 +296,45 @@ def _numbers(part: _OnNodes, v: PyTree) -> list[np.ndarray]:
 def _summed(nodes: np.ndarray, x: Array, forces: Array) -> Array:
     """(N, ...) like x: what forces (E, k, ...) on these nodes add up to."""
     number = np.shape(x)[0]
-    forces = forces.reshape(nodes.size, -1)
-    return _at_nodes(nodes.ravel().tobytes(), number).transpose(forces).reshape(np.shape(x))
+    forces = forces.reshape(*nodes.shape, -1)
+    return _at_nodes(nodes.tobytes(), nodes.shape, number).transpose(forces).reshape(np.shape(x))
 
 
 @lru_cache(maxsize=256)
-def _at_nodes(places: bytes, number: int) -> Linear:
-    """The map from (..., number, r) to the rows at these places; transposed it adds rows up: by gathers, both."""
-    rows = np.frombuffer(places, np.int32)
+def _at_nodes(nodes: bytes, shape: tuple, number: int) -> Linear:
+    """The map from (..., number, r) to the rows (..., E, k, r) at nodes (E, k); transposed it adds rows up.
+
+    Where each node is the next of that of the element before, as in chains, by slices; else by gathers, both."""
+    places = np.frombuffer(nodes, np.int32).reshape(shape)
+    starts = places[0]
+    if np.array_equal(places, starts + np.arange(shape[0])[:, None]):
+        return _in_turn([int(x) for x in starts], shape[0], number)
+    rows = places.ravel()
     table = table_of(rows, number) if len(rows) > FEW else None
 
     def take(x: Array) -> Array:
-        return x.at[..., rows, :].get(mode="promise_in_bounds")
+        return x.at[..., rows, :].get(mode="promise_in_bounds").reshape(*x.shape[:-2], *shape, x.shape[-1])
 
     def add(y: Array) -> Array:
+        y = y.reshape(*y.shape[:-3], -1, y.shape[-1])
         if table is None:
             return jnp.zeros((*y.shape[:-2], number, y.shape[-1]), y.dtype).at[..., rows, :].add(y)
         y = jnp.concatenate([y, jnp.zeros_like(y[..., :1, :])], axis=-2)
         return reduce(jnp.add, [y.at[..., row, :].get(mode="promise_in_bounds") for row in table])
+
+    return Linear(take, add)
+
+
+def _in_turn(starts: list[int], count: int, number: int) -> Linear:
+    """The same where element i has the nodes starts + i."""
+
+    def take(x: Array) -> Array:
+        return jnp.stack([x[..., s : s + count, :] for s in starts], axis=-2)
+
+    def add(y: Array) -> Array:
+        none = [(0, 0)] * (y.ndim - 3)
+        ends = [(s, number - count - s) for s in starts]
+        return reduce(jnp.add, [jnp.pad(y[..., i, :], [*none, x, (0, 0)]) for i, x in enumerate(ends)])
 
     return Linear(take, add)
 

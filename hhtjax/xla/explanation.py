@@ -42,7 +42,7 @@ def explain(f: Callable, *args: Real) -> Explanation:
     On the CPU each becomes one kernel if XLA can compile it so, several times faster on a small system, and a list of
     kernels if not, as on other platforms: with LAPACK (more than 16 unknowns), sort, scatter
     (`x.at[i].add(y)`, of `x[i]` the reverse derivative) of more than 32 numbers or of a batch with an i for each, large
-    products and sums, a callback such as progress=True. Values differ by rounding.
+    products of matrices, a callback such as progress=True. Values differ by rounding.
     Inside `hhtjax.plain()`, or with a JAX newer than those that this is tested with, every path is plain, and says so.
 
     Args:
