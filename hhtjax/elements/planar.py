@@ -46,12 +46,11 @@ def planar_beam(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) ->
     [[ 10.   0.]
      [-10.   0.]]
     """
-    strain, rates = _kinematics("planar_beam", q, each, STIFFNESS)
-    L, stiffness = number("planar_beam", each, "L", strain), numbers("planar_beam", each, STIFFNESS, strain)
-    of_v, transposed = jax.vjp(rates, {name: v[name] for name in ("r", "theta")})
+    strain, rates, pulls = _kinematics("planar_beam", q, each, STIFFNESS)
+    stiffness = numbers("planar_beam", each, STIFFNESS, strain)
     if "damping" in each:
-        strain = strain + number("planar_beam", each, "damping", strain) * of_v
-    return transposed(-L * stiffness * strain)[0]
+        strain = strain + number("planar_beam", each, "damping", strain) * rates(v)
+    return pulls(stiffness * strain)
 
 
 def planar_strain(q: PyTree, each: PyTree) -> jax.Array:
@@ -128,7 +127,8 @@ def lumped(nodes: Array, half: Array, num_nodes: int) -> jax.Array:
 
 
 def _kinematics(caller: str, q: PyTree, each: PyTree, stiffness: tuple):
-    """The strains (3,), and their rates as a function of v that is linear."""
+    """The strains (3,), their rates as a function of v, and the force on the nodes as one of what works on the strains:
+    -L times the transpose of the rates."""
     require_nodes(caller, q, r=(2, 2), theta=(2,))
     require_each(caller, each, "L", *stiffness)
     r, theta = q["r"], q["theta"]
@@ -151,4 +151,10 @@ def _kinematics(caller: str, q: PyTree, each: PyTree, stiffness: tuple):
         spin = (v["theta"][0] + v["theta"][1]) / 2
         return jnp.stack([along + shear * spin, across - stretch * spin, (v["theta"][1] - v["theta"][0]) / L])
 
-    return strain, rates
+    def pulls(section: Array) -> dict:
+        N, V, M = section
+        force = jnp.stack([c * N - s * V, s * N + c * V])
+        half = L / 2 * (shear * N - stretch * V)
+        return {"r": jnp.stack([force, -force]), "theta": jnp.stack([M - half, -M - half])}
+
+    return strain, rates, pulls

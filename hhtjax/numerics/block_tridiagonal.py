@@ -31,7 +31,7 @@ class BlockFactors(NamedTuple):
 
 
 def factorize_blocks(lower: Array, middle: Array, upper: Array) -> BlockFactors:
-    """Of the matrix of these blocks (N, b, b); the first of `lower` and the last of `upper` are not read."""
+    """Of the matrix of these blocks (N, b, b); the first of `lower` and the last of `upper` meet zeros."""
     b = middle.shape[-1]
 
     def eliminate(before: Array, blocks: tuple):
@@ -41,7 +41,6 @@ def factorize_blocks(lower: Array, middle: Array, upper: Array) -> BlockFactors:
         return W, (S, W)
 
     none = jnp.zeros((b, b), middle.dtype)
-    lower = lower.at[0].set(0)
     _, (inverse, ahead) = lax.scan(eliminate, none, (lower, middle, upper))
     return BlockFactors(lower, inverse, ahead)
 
@@ -118,4 +117,4 @@ def block_pivots(lower: Array, middle: Array, upper: Array, limit: float) -> Arr
         return both[:, b:], found
 
     none = jnp.zeros((b, b), middle.dtype)
-    return lax.scan(eliminate, none, (lower.at[0].set(0), middle, upper))[1]
+    return lax.scan(eliminate, none, (lower, middle, upper))[1]

@@ -40,6 +40,14 @@ class Numbers(NamedTuple):
     table: np.ndarray
 
 
+class Blocks(NamedTuple):
+    """A matrix as a row of blocks: those before, on and behind the diagonal, (N, b, b) each."""
+
+    lower: Array
+    middle: Array
+    upper: Array
+
+
 class Plan:
     """How a matrix (n, n) with a pattern is factorised. free: number of unknowns that are no multipliers.
 
@@ -62,14 +70,16 @@ class Plan:
         """(n,): of each column."""
         return colours(self.pattern, self.blocks.order)
 
-    def by_products(self, f: Callable, like: PyTree) -> Numbers:
+    def by_products(self, f: Callable, like: PyTree) -> Numbers | Blocks:
         """The matrix of a linear map f, by its products with a vector for each colour."""
+        if self.is_full:
+            return self._blocks_by_products(f, like)
         number = int(self.colour.max()) + 1
         probes = jnp.asarray(self.colour)[None, :] == jnp.arange(number)[:, None]
         images = lax.stop_gradient(jax.vmap(f)(probes.astype(like.dtype)))
         return Numbers(images.ravel(), (self.colour[self.columns] * self.n + self.rows)[None])
 
-    def inverse(self, A: Numbers) -> Callable:
+    def inverse(self, A: Numbers | Blocks) -> Callable:
         """(b, trans=0) -> A^-1 b, or A^-T b."""
         return self._by_blocks(A) if self.is_in_blocks else self._by_superlu(A)
 
@@ -88,6 +98,37 @@ class Plan:
         return gather(part(partial(block_pivots, limit=limit))(*blocks).ravel(), self.there)
 
     # in blocks
+
+    @cached_property
+    def is_full(self) -> bool:
+        """Whether all blocks are of one size, and three colours for each place tell all of them."""
+        b = self.blocks.size
+        return self.is_in_blocks and self.n % b == 0 and (len(self.blocks.starts) - 1) * b == self.n
+
+    def _blocks_by_products(self, f: Callable, like: PyTree) -> Blocks:
+        """The blocks, by products with what is 1 at one place of every third block."""
+        b = self.blocks.size
+        colour = jnp.asarray(self.block % 3 * b + self.place)
+        probes = colour[None, :] == jnp.arange(3 * b)[:, None]
+        images = lax.stop_gradient(jax.vmap(f)(probes.astype(like.dtype)))
+        images = jnp.moveaxis(self._rows_of(images).reshape(3, b, -1, b), 1, -1)  # (3, N, b, b)
+        own = np.arange(images.shape[1]) % 3
+
+        def at(shift: int) -> Array:
+            third = (own + shift) % 3
+            one, two = (jnp.asarray(third == i)[:, None, None] for i in (1, 2))
+            return jnp.where(one, images[1], jnp.where(two, images[2], images[0]))
+
+        return Blocks(at(-1), at(0), at(1))
+
+    def _rows_of(self, x: Array) -> Array:
+        """(..., N, b) of (..., n): unknowns as the blocks have them."""
+        columns = [np.flatnonzero(self.place == k) for k in range(self.blocks.size)]
+        columns = [i[np.argsort(self.block[i])] for i in columns]
+        N = len(self.blocks.starts) - 1
+        if all(np.array_equal(i, i[0] + np.arange(N) * (i[1] - i[0])) and i[1] > i[0] for i in columns):
+            return jnp.stack([x[..., i[0] : i[-1] + 1 : i[1] - i[0]] for i in columns], axis=-1)
+        return jnp.stack([x.at[..., i].get(mode="promise_in_bounds") for i in columns], axis=-1)
 
     @cached_property
     def block(self) -> np.ndarray:
@@ -121,16 +162,16 @@ class Plan:
         found[1, i, k, k] = len(row) + 1
         return found
 
-    def _in_blocks(self, A: Numbers) -> Array:
-        return _added(A, self.entry_in_blocks)
+    def _in_blocks(self, A: Numbers | Blocks) -> Blocks:
+        return A if isinstance(A, Blocks) else Blocks(*_added(A, self.entry_in_blocks))
 
     def _by_blocks(self, A: Numbers) -> Callable:
         blocks = self._in_blocks(A)
-        N, b = blocks.shape[1:3]
+        N, b = blocks.middle.shape[:2]
         free = np.ones((N, b), bool)
         free.ravel()[self.there[self.free :]] = False
         scale = _row_scale(blocks, free)
-        factors = part(factorize_blocks)(*(blocks * scale[None, :, :, None]))
+        factors = part(factorize_blocks)(*(x * scale[:, :, None] for x in blocks))
         here = np.full(N * b, self.n, np.int32)
         here[self.there] = np.arange(self.n, dtype=np.int32)
         in_order = np.array_equal(here, np.arange(self.n))
@@ -170,10 +211,10 @@ class Plan:
         return lambda b, trans=0: scale * solve(b, trans=1) if trans else solve(scale * b)
 
 
-def _row_scale(blocks: Array, free: np.ndarray) -> Array:
+def _row_scale(blocks: Blocks, free: np.ndarray) -> Array:
     """(N, b): equations are measured by the square roots of their diagonal, and constraints by those of their unknowns,
     so that no units choose the pivots; as of `factorize_saddle_point`."""
-    d = jnp.abs(_diagonals(blocks[1]))
+    d = jnp.abs(_diagonals(blocks.middle))
     first = jnp.where(free, 1 / jnp.sqrt(jnp.where(d == 0, 1, d)), 0)
     if free.all():
         return first
