@@ -62,12 +62,11 @@ def spatial_beam(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -
     [[ 0.2  0.   0. ]
      [-0.2  0.   0. ]]
     """
-    strain, rates = _kinematics("spatial_beam", q, each, STIFFNESS)
-    L, stiffness = number("spatial_beam", each, "L", strain), numbers("spatial_beam", each, STIFFNESS, strain)
-    of_v, transposed = jax.vjp(rates, {name: v[name] for name in ("r", "R")})
+    strain, rates, pulls = _kinematics("spatial_beam", q, each, STIFFNESS)
+    stiffness = numbers("spatial_beam", each, STIFFNESS, strain)
     if "damping" in each:
-        strain = strain + number("spatial_beam", each, "damping", strain) * of_v
-    return transposed(-L * stiffness * strain)[0]
+        strain = strain + number("spatial_beam", each, "damping", strain) * rates(v)
+    return pulls(stiffness * strain)
 
 
 def spatial_strain(q: PyTree, each: PyTree) -> jax.Array:
@@ -151,7 +150,8 @@ def _frame(caller: str, each: PyTree, like: Array):
 
 
 def _kinematics(caller: str, q: PyTree, each: PyTree, stiffness: tuple):
-    """The strains (6,), and their rates as a function of v that is linear."""
+    """The strains (6,), their rates as a function of v, and the force on the nodes as one of what works on the strains:
+    -L times the transpose of the rates."""
     require_nodes(caller, q, r=(2, 3), R=(2, 3, 3))
     require_each(caller, each, "L", *stiffness)
     r, (R1, R2) = q["r"], q["R"]
@@ -175,7 +175,16 @@ def _kinematics(caller: str, q: PyTree, each: PyTree, stiffness: tuple):
         bending = matvec(inverse, Om2) - matvec(inverse.T, Om1)
         return jnp.concatenate([in_beam(stretching), in_beam(bending) / L])
 
-    return strain, rates
+    def pulls(section: Array) -> dict:
+        n, m = section[:3], section[3:]
+        if B is not None:
+            n, m = matvec(B, n), matvec(B, m)
+        force, moment = matvec(middle, n), L * rotation.cross(n, along)
+        half, more = moment / 2, share * rotation.cross(moment, psi)
+        first, second = matvec(inverse, m) - half + more, -matvec(inverse.T, m) - half - more
+        return {"r": jnp.stack([force, -force]), "R": jnp.stack([first, second])}
+
+    return strain, rates, pulls
 
 
 def _share(psi: Array) -> Array:

@@ -101,9 +101,9 @@ class Plan:
 
     @cached_property
     def is_full(self) -> bool:
-        """Whether all blocks are of one size, and three colours for each place tell all of them."""
-        b = self.blocks.size
-        return self.is_in_blocks and self.n % b == 0 and (len(self.blocks.starts) - 1) * b == self.n
+        """Whether all blocks are of one size, and no fewer colours tell them than three for each place."""
+        N, b = len(self.blocks.starts) - 1, self.blocks.size
+        return self.is_in_blocks and N > 1 and N * b == self.n and self.colour.max() + 1 >= 3 * b
 
     def _blocks_by_products(self, f: Callable, like: PyTree) -> Blocks:
         """The blocks, by products with what is 1 at one place of every third block."""
