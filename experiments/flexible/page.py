@@ -120,6 +120,7 @@ def page(numbers):
             violation=seen["four_bar"]["violation_m"],
             rope_unknowns=cost["rope"]["unknowns"],
             rope_s=cost["rope"]["seconds"],
+            rope_farthest=seen["farthest_by_predictor_m"],
             accuracy=accuracy(numbers["accuracy"]),
             fit=fit(material),
             fit_unknowns=material["unknowns"],

@@ -285,8 +285,8 @@ class Solution(NamedTuple):
         started = [x for x in jax.tree.leaves(self.acceleration) if is_concrete(x)]
         if not all(np.isfinite(np.asarray(x)[(*member, 0)]).all() for x in started):
             return (
-                "the acceleration is not finite at the start already: there the mass is singular, constraints depend on "
-                "each other (outside jit an error names them), or a function of the system is not finite"
+                "the acceleration is not finite at the start already: there the mass is singular, constraints depend "
+                "on each other (outside jit an error names them), or a function of the system is not finite"
             )
         is_first_order = self.acceleration is None and self.output is None
         names = ("y", "y'") if is_first_order else QUANTITIES

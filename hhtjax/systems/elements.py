@@ -115,6 +115,11 @@ class _OnNodes:
         )
         return (each,), (jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, each),)
 
+    def mapped(self, f: Callable, params: PyTree, *of_nodes: PyTree) -> PyTree:
+        """f(own leaves of each of these, and of `each`) for all rows of `nodes`, in the dtype of the last of them."""
+        own, axes = self.own_numbers(params, jnp.result_type(jax.tree.leaves(of_nodes[-1])[0]))
+        return jax.vmap(f, (*(0 for _ in of_nodes), *axes))(*map(self.own, of_nodes), *own)
+
     def _checked_each(self, each: PyTree) -> PyTree:
         for path, x in jax.tree_util.tree_leaves_with_path(each):
             if jnp.ndim(x) and jnp.shape(x)[0] != self.count:
@@ -155,30 +160,33 @@ class Elements(_OnNodes):
 
     def __call__(self, q: PyTree, v: PyTree, t: Real, params: PyTree) -> PyTree:
         """The force on all nodes, structured like v."""
-        own, axes = self.own_numbers(params, _dtype(v))
-        force = jax.vmap(lambda q, v, *own: self.complete(v, self.function(q, v, t, params, *own)), (0, 0, *axes))
-        return self.added(v, force(self.own(q), self.own(v), *own))
+
+        def force(q: PyTree, v: PyTree, *each) -> PyTree:
+            return self.complete(v, self.function(q, v, t, params, *each))
+
+        return self.added(v, self.mapped(force, params, q, v))
 
     def product(self, q: PyTree, w: PyTree, params: PyTree) -> PyTree:
         """M w of all nodes, where the function gives that of one element."""
-        own, axes = self.own_numbers(params, _dtype(w))
-        product = jax.vmap(lambda q, w, *own: self.complete(w, self.function(q, w, params, *own)), (0, 0, *axes))
-        return self.added(w, product(self.own(q), self.own(w), *own))
+
+        def product(q: PyTree, w: PyTree, *each) -> PyTree:
+            return self.complete(w, self.function(q, w, params, *each))
+
+        return self.added(w, self.mapped(product, params, q, w))
 
     def matrices(self, q: PyTree, v: PyTree, params: PyTree) -> Array:
         """(E, s, s): the masses of the elements."""
-        own, axes = self.own_numbers(params, _dtype(v))
 
-        def matrix(q: PyTree, v: PyTree, *own) -> Array:
+        def matrix(q: PyTree, v: PyTree, *each) -> Array:
             zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, v))
 
             def of(x: Array) -> Array:
                 w = unravel(x)
-                return ravel_pytree(self.complete(w, self.function(q, w, params, *own)))[0]
+                return ravel_pytree(self.complete(w, self.function(q, w, params, *each)))[0]
 
             return jax.jacfwd(of)(zero)
 
-        return jax.vmap(matrix, (0, 0, *axes))(self.own(q), self.own(v), *own)
+        return self.mapped(matrix, params, q, v)
 
     def added(self, v: PyTree, forces: PyTree) -> PyTree:
         """What leaves (E, k, ...) of the elements add up to at the nodes, structured like v."""
@@ -226,8 +234,7 @@ class Joints(_OnNodes):
 
     def __call__(self, q: PyTree, t: Real, params: PyTree) -> Array:
         """The rows of all joints, (J m,)."""
-        own, axes = self.own_numbers(params, _dtype(q))
-        rows = jax.vmap(lambda q, *own: self.function(q, t, params, *own), (0, *axes))(self.own(q), *own)
+        rows = self.mapped(lambda q, *each: self.function(q, t, params, *each), params, q)
         if not is_array(rows) or jnp.ndim(rows) != 2:
             of_one = jax.tree.map(lambda x: jnp.shape(x)[1:], rows)
             raise ValueError(f"Joints: `function` must return the rows (m,) of one joint; received shape {of_one}.")
@@ -271,10 +278,6 @@ def _taken(name: str, tree: PyTree, nodes: np.ndarray) -> PyTree:
         return rows.reshape(*nodes.shape, *x.shape[1:])
 
     return jax.tree.map(take, tree)
-
-
-def _dtype(tree: PyTree) -> np.dtype:
-    return jnp.result_type(jax.tree.leaves(tree)[0])
 
 
 def _numbers(part: _OnNodes, v: PyTree) -> list[np.ndarray]:
