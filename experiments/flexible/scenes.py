@@ -169,7 +169,7 @@ def flexible_four_bar(fast: bool) -> tuple[list[dict], dict]:
 def rope(fast: bool) -> tuple[list[dict], dict]:
     """A cable of 1000 ANCF elements that swings down from the horizontal until after its end has cracked like a whip.
 
-    Against half as many elements, half the step, and Newton's iteration. At the crack a node turns by a radian a step,
+    Against half as many elements, half the step, and Newton's iteration. At the crack a node turns by .2 rad a step,
     and a solve about the predictor alone throws it away: how far is measured.
     """
     described = ROPE._replace(elements=10) if fast else ROPE
