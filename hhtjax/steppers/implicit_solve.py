@@ -358,8 +358,9 @@ def linearized_step(
     D = system.with_ones(diagonal(system.mass(s.q, s.t, params)))
     limit = HELD_THRESHOLD**2 * jnp.sum(D * s.w**2)
     ways = path(s.w), held, lambda r: jnp.sum(r * (r / D)), limit
+    better = better_solve if system.sparse is None else partial(better_solve_in_turn, lambda: expand.path(s.w))
     # derivatives by one expansion about the state that was chosen: through both they would take longer to compile
-    return derivative_of(lambda: about(better_state(r, *ways))[:2], lambda: better_solve(about, *ways[1:]))
+    return derivative_of(lambda: about(better_state(r, *ways))[:2], lambda: better(about, *ways[1:]))
 
 
 def linearize(f: Callable, x: Array | State):
@@ -390,6 +391,29 @@ def better_solve(about: Callable, held: State, size: Callable, limit: Array):
         return tree_where(predicted_size <= size(expansion.here), found, (w, info))
 
     return call_where(better, ~(predicted_size <= limit), (w, info))
+
+
+def better_solve_in_turn(path: Callable, about: Callable, held: State, size: Callable, limit: Array):
+    """The same by a loop that is gone through once or twice: a large program then holds one expansion, not two."""
+    start, along = path()
+    first = Expansion(None, start, None, along, None)
+
+    def at_state(at: State):
+        w, info, expansion = about(at, first)
+        return (w, info), size(expansion.here)
+
+    at_state = traced(at_state, held)
+    found, like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), at_state.result)
+
+    def visit(carry: tuple):
+        found, smallest, count, _ = carry
+        is_first = count == 0
+        other, here = at_state(tree_where(is_first, start, held))
+        found = tree_where(is_first | ~(smallest <= here), other, found)
+        return found, jnp.where(is_first, here, smallest), count + 1, is_first & ~(here <= limit)
+
+    begin = found, like, jnp.zeros((), jnp.int32), jnp.array(True)
+    return lax.while_loop(lambda carry: carry[3], visit, begin)[0]
 
 
 def refresh(system: FlatSystem, params: PyTree, c, s, factorize):

@@ -39,10 +39,10 @@ from jax import lax
 from hhtjax.description import Array, PyTree
 from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.batched_cond import call_where, derivative_at_need, tree_where
-from hhtjax.numerics.closures import hoisted
+from hhtjax.numerics.closures import carried, hoisted
 from hhtjax.numerics.dense_lu import UNROLLED, diagonal, differentiable_inverse, inverse, matvec
 from hhtjax.numerics.differentiable_while import implicit_root
-from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
+from hhtjax.numerics.linear_solve import Trusted, factorize_map, invert, solve_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.shortened_newton import improved
 from hhtjax.primitives import one_kernel, staged, traced
@@ -319,8 +319,15 @@ def without_layer(
         known = layer.with_data(data)
         how = factors(method, known.system, known.params, known.V) if factorize is None else factorize
         z = known.zeros() if known.system.linear or not damped else root(known, how)
-        inverse, z, at, tangent = newton_step(known, how, z)
-        drag, damps = damping(known, how, at, tangent)
+        return behind(known, how, h, *newton_step(known, how, z))
+
+    def by_search(method: Stepper, data: PyTree, h: Array) -> Found:
+        known = layer.with_data(data)
+        how = factors(method, known.system, known.params, known.V) if factorize is None else factorize
+        return behind(known, how, h, *searched_by_maps(known, how))
+
+    def behind(known: Layer, how: Callable, h: Array, inverse: Callable, z: Array, tangent: Callable) -> Found:
+        drag, damps = damping(known, how, tangent)
         return finish(method, known, inverse, drag if damped else None, z, h, corrects)._replace(damps=damps)
 
     def by_matrices(
@@ -339,7 +346,9 @@ def without_layer(
     data = layer.data()
     large = layer.zeros().size > (UNROLLED if layer.system.linear else LARGEST)
     if large or options.solve is not None or options.redundant is not None or layer.system.sparse is not None:
-        return by_maps(method, data, h)
+        if layer.system.linear or not damped:
+            return by_maps(method, data, h)
+        return derivative_at_need(by_maps, by_search, method, data, h)
     moving = partial(by_matrices, differentiable, differentiable_inverse)
     return derivative_at_need(moving, partial(by_matrices, searched, inverse), method, data, h)
 
@@ -441,16 +450,38 @@ def differentiable(layer: Layer):
 
 
 def newton_step(layer: Layer, factorize: Callable | Given | Constant, z: Array):
-    """The solve with the matrix at z, the z that it leads to, the state there, and the tangent of the rows."""
+    """The solve with the matrix at z, the z that it leads to, and the tangent of the rows."""
     at, along = jax.linearize(layer.path, z)
     value, tangent = linearize_rows(layer.rows, at)
     inverse = factorize_map(lambda dz: tangent(along(dz)), value, around(factorize, lambda: (at, along)))
-    return inverse, z - inverse(value), at, tangent
+    return inverse, z - inverse(value), tangent
 
 
-def damping(layer: Layer, factorize: Callable | Given | Constant, at: State, tangent: Callable):
+def searched_by_maps(layer: Layer, factorize: Callable | Given | Constant):
+    """The same where Newton's method ends: the last of its loop's, so that a program holds them once."""
+    n, maps = layer.system.size, []
+
+    def around_it(z: Array):
+        at, along = jax.linearize(layer.path, z)
+        value, tangent = linearize_rows(layer.rows, at)
+        solve = invert(lambda dz: tangent(along(dz)), value, around(factorize, lambda: (at, along)))
+        inverse, of_inverse = carried(lambda b: solve(b, trans=0), z)
+        slope, of_slope = carried(tangent, at)
+        maps[:] = inverse, slope
+        dz = solve(value, trans=0)
+        return dz, jnp.abs(jnp.sum(dz[:n] * value[:n])), of_inverse, of_slope
+
+    step = traced(around_it, layer.zeros())
+    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), step.result[2:])
+    z, dz, *constants = improved(step, layer.zeros(), *empty)
+    inverse, slope = map(partial, maps, constants)
+    return inverse, z - dz, slope
+
+
+def damping(layer: Layer, factorize: Callable | Given | Constant, tangent: Callable):
     """The map (C + C^T)/2 at a state, and whether it is anything but 0."""
-    zero, v = jax.tree.map(jnp.zeros_like, at), layer.base.v
+    v = layer.base.v
+    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(layer.path, layer.zeros()))
 
     def drag(x: Array) -> Array:
         return tangent(zero._replace(v=layer.located(x)))[: v.size]
