@@ -358,9 +358,11 @@ def linearized_step(
     D = system.with_ones(diagonal(system.mass(s.q, s.t, params)))
     limit = HELD_THRESHOLD**2 * jnp.sum(D * s.w**2)
     ways = path(s.w), held, lambda r: jnp.sum(r * (r / D)), limit
-    better = better_solve if system.sparse is None else partial(better_solve_in_turn, lambda: expand.path(s.w))
+    better = partial(better_solve, about)
+    if system.sparse is not None:
+        better = partial(better_solve_in_turn, about, lambda: expand.path(s.w))
     # derivatives by one expansion about the state that was chosen: through both they would take longer to compile
-    return derivative_of(lambda: about(better_state(r, *ways))[:2], lambda: better(about, *ways[1:]))
+    return derivative_of(lambda: about(better_state(r, *ways))[:2], lambda: better(*ways[1:]))
 
 
 def linearize(f: Callable, x: Array | State):
@@ -393,27 +395,28 @@ def better_solve(about: Callable, held: State, size: Callable, limit: Array):
     return call_where(better, ~(predicted_size <= limit), (w, info))
 
 
-def better_solve_in_turn(path: Callable, about: Callable, held: State, size: Callable, limit: Array):
-    """The same by a loop that is gone through once or twice: a large program then holds one expansion, not two."""
-    start, along = path()
-    first = Expansion(None, start, None, along, None)
+def better_solve_in_turn(about: Callable, first: Callable, held: State, size: Callable, limit: Array):
+    """The same by a loop that is gone through once or twice: a large program then holds one expansion, not two.
 
-    def at_state(at: State):
-        w, info, expansion = about(at, first)
+    first: () -> path(w), as of `Expand`."""
+    start, along = first()
+    known = Expansion(None, start, None, along, None)
+
+    def solved(at: State):
+        w, info, expansion = about(at, known)
         return (w, info), size(expansion.here)
 
-    at_state = traced(at_state, held)
-    found, like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), at_state.result)
+    solved = traced(solved, held)
 
     def visit(carry: tuple):
-        found, smallest, count, _ = carry
-        is_first = count == 0
-        other, here = at_state(tree_where(is_first, start, held))
+        found, smallest, is_first, _ = carry
+        other, here = solved(tree_where(is_first, start, held))
         found = tree_where(is_first | ~(smallest <= here), other, found)
-        return found, jnp.where(is_first, here, smallest), count + 1, is_first & ~(here <= limit)
+        return found, here, jnp.array(False), is_first & ~(here <= limit)
 
-    begin = found, like, jnp.zeros((), jnp.int32), jnp.array(True)
-    return lax.while_loop(lambda carry: carry[3], visit, begin)[0]
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), solved.result)
+    yes = jnp.array(True)
+    return lax.while_loop(lambda carry: carry[3], visit, (*nothing, yes, yes))[0]
 
 
 def refresh(system: FlatSystem, params: PyTree, c, s, factorize):

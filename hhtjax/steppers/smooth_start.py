@@ -327,8 +327,8 @@ def without_layer(
         return behind(known, how, h, *searched_by_maps(known, how))
 
     def behind(known: Layer, how: Callable, h: Array, inverse: Callable, z: Array, tangent: Callable) -> Found:
-        drag, damps = damping(known, how, tangent)
-        return finish(method, known, inverse, drag if damped else None, z, h, corrects)._replace(damps=damps)
+        drag, damps = damping(known, how, tangent) if damped else (None, None)
+        return finish(method, known, inverse, drag, z, h, corrects)._replace(damps=damps)
 
     def by_matrices(
         find: Callable, invert: Callable, method: Beginning | GeneralizedAlpha, data: PyTree, h: Array
@@ -458,24 +458,22 @@ def newton_step(layer: Layer, factorize: Callable | Given | Constant, z: Array):
 
 
 def searched_by_maps(layer: Layer, factorize: Callable | Given | Constant):
-    """The same where Newton's method ends: the last of its loop's, so that a program holds them once."""
-    n, maps = layer.system.size, []
+    """The same where Newton's method ends, without derivatives: what its loop finds last is handed on, so that a program
+    holds one linearisation and one factorisation, not two."""
+    n = layer.system.size
 
     def around_it(z: Array):
         at, along = jax.linearize(layer.path, z)
         value, tangent = linearize_rows(layer.rows, at)
-        solve = invert(lambda dz: tangent(along(dz)), value, around(factorize, lambda: (at, along)))
-        inverse, of_inverse = carried(lambda b: solve(b, trans=0), z)
-        slope, of_slope = carried(tangent, at)
-        maps[:] = inverse, slope
-        dz = solve(value, trans=0)
-        return dz, jnp.abs(jnp.sum(dz[:n] * value[:n])), of_inverse, of_slope
+        inverse = invert(lambda dz: tangent(along(dz)), value, around(factorize, lambda: (at, along)))
+        dz = inverse(value, trans=0)
+        maps = carried(partial(inverse, trans=0), z), carried(tangent, at)
+        return dz, jnp.abs(jnp.sum(dz[:n] * value[:n])), *maps
 
     step = traced(around_it, layer.zeros())
     empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), step.result[2:])
-    z, dz, *constants = improved(step, layer.zeros(), *empty)
-    inverse, slope = map(partial, maps, constants)
-    return inverse, z - dz, slope
+    z, dz, inverse, tangent = improved(step, layer.zeros(), *empty)
+    return inverse, z - dz, tangent
 
 
 def damping(layer: Layer, factorize: Callable | Given | Constant, tangent: Callable):
