@@ -458,7 +458,7 @@ def newton_step(layer: Layer, factorize: Callable | Given | Constant, z: Array):
 
 
 def searched_by_maps(layer: Layer, factorize: Callable | Given | Constant):
-    """The same where Newton's method ends, without derivatives: what its loop finds last is handed on, so that a program
+    """The same where Newton's method ends, without derivatives: its loop hands on what it finds last, so that a program
     holds one linearisation and one factorisation, not two."""
     n = layer.system.size
 
