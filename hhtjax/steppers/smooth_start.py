@@ -315,18 +315,10 @@ def without_layer(
     """
     options = method.options
 
-    def by_maps(method: Stepper, data: PyTree, h: Array) -> Found:
+    def by_maps(find: Callable, method: Stepper, data: PyTree, h: Array) -> Found:
         known = layer.with_data(data)
         how = factors(method, known.system, known.params, known.V) if factorize is None else factorize
-        z = known.zeros() if known.system.linear or not damped else root(known, how)
-        return behind(known, how, h, *newton_step(known, how, z))
-
-    def by_search(method: Stepper, data: PyTree, h: Array) -> Found:
-        known = layer.with_data(data)
-        how = factors(method, known.system, known.params, known.V) if factorize is None else factorize
-        return behind(known, how, h, *searched_by_maps(known, how))
-
-    def behind(known: Layer, how: Callable, h: Array, inverse: Callable, z: Array, tangent: Callable) -> Found:
+        inverse, z, tangent = find(known, how)
         drag, damps = damping(known, how, tangent) if damped else (None, None)
         return finish(method, known, inverse, drag, z, h, corrects)._replace(damps=damps)
 
@@ -347,8 +339,8 @@ def without_layer(
     large = layer.zeros().size > (UNROLLED if layer.system.linear else LARGEST)
     if large or options.solve is not None or options.redundant is not None or layer.system.sparse is not None:
         if layer.system.linear or not damped:
-            return by_maps(method, data, h)
-        return derivative_at_need(by_maps, by_search, method, data, h)
+            return by_maps(lambda known, how: newton_step(known, how, known.zeros()), method, data, h)
+        return derivative_at_need(partial(by_maps, at_root), partial(by_maps, searched_by_maps), method, data, h)
     moving = partial(by_matrices, differentiable, differentiable_inverse)
     return derivative_at_need(moving, partial(by_matrices, searched, inverse), method, data, h)
 
@@ -391,8 +383,7 @@ def finished(
     lag = lag_left(layer, inverse)
     if not corrects:
         return Found(v, z, lag=lag)
-    dw, dL = layer.parts(z)
-    base = layer.base
+    (dw, dL), base = layer.parts(z), layer.base
     s = base._replace(v=v, w=base.w + dw, L=None if dL is None else base.L + dL)
     return Found(v, z, layer.parts(rate_of(layer, s, inverse, h))[0])
 
@@ -457,9 +448,29 @@ def newton_step(layer: Layer, factorize: Callable | Given | Constant, z: Array):
     return inverse, z - inverse(value), tangent
 
 
+def at_root(layer: Layer, factorize: Callable | Given | Constant):
+    """The same where Newton's method ends; differentiated by the implicit-function theorem."""
+    n = layer.system.size
+
+    def f(z):
+        return layer.rows(layer.path(z))
+
+    def search(z):
+        def around_it(z):
+            value, tangent = linearized(f, z)
+            dz = factorize_map(tangent, value, around(factorize, lambda: jax.linearize(layer.path, z)))(value)
+            return dz, jnp.abs(jnp.sum(dz[:n] * value[:n]))
+
+        return improved(around_it, z)[0], None
+
+    def tangent_solve(g, y):
+        return solve_map(g, y, factorize)
+
+    return newton_step(layer, factorize, implicit_root(f, layer.zeros(), search, tangent_solve)[0])
+
+
 def searched_by_maps(layer: Layer, factorize: Callable | Given | Constant):
-    """The same where Newton's method ends, without derivatives: its loop hands on what it finds last, so that a program
-    holds one linearisation and one factorisation, not two."""
+    """The same as `at_root`, without derivatives: its loop hands on the maps found last, so that none is twice."""
     n = layer.system.size
 
     def around_it(z: Array):
@@ -471,15 +482,14 @@ def searched_by_maps(layer: Layer, factorize: Callable | Given | Constant):
         return dz, jnp.abs(jnp.sum(dz[:n] * value[:n])), *maps
 
     step = traced(around_it, layer.zeros())
-    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), step.result[2:])
-    z, dz, inverse, tangent = improved(step, layer.zeros(), *empty)
+    z, dz, inverse, tangent = improved(step, layer.zeros(), *jax.tree.map(jnp.zeros_like, step.result[2:]))
     return inverse, z - dz, tangent
 
 
 def damping(layer: Layer, factorize: Callable | Given | Constant, tangent: Callable):
     """The map (C + C^T)/2 at a state, and whether it is anything but 0."""
     v = layer.base.v
-    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(layer.path, layer.zeros()))
+    zero = jax.tree.map(jnp.zeros_like, jax.eval_shape(layer.path, layer.zeros()))
 
     def drag(x: Array) -> Array:
         return tangent(zero._replace(v=layer.located(x)))[: v.size]
@@ -588,24 +598,3 @@ def rate_of(layer: Layer, s: State, inverse: Callable, h: Array) -> Array:
 
     before, after = lax.map(rows, jnp.stack([jnp.zeros_like(h), LATER * h]))
     return corrected_by(layer, inverse, (after - before) / (LATER * h))
-
-
-def root(layer, factorize):
-    """z behind the implicit step; differentiated by the implicit-function theorem."""
-    n = layer.system.size
-
-    def f(z):
-        return layer.rows(layer.path(z))
-
-    def search(z):
-        def around_it(z):
-            value, tangent = linearized(f, z)
-            dz = factorize_map(tangent, value, around(factorize, lambda: jax.linearize(layer.path, z)))(value)
-            return dz, jnp.abs(jnp.sum(dz[:n] * value[:n]))
-
-        return improved(around_it, z)[0], None
-
-    def tangent_solve(g, y):
-        return solve_map(g, y, factorize)
-
-    return implicit_root(f, layer.zeros(), search, tangent_solve)[0]
