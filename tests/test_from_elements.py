@@ -447,3 +447,18 @@ def test_weights_of_nodes_alone_fall():
     system = System.from_elements(Elements(weight, np.arange(20)[:, None]), mass=2.0)
     found = run((system, jnp.zeros((20, 2)), jnp.zeros((20, 2))))
     np.testing.assert_allclose(found.q[-1, :, 1], -PARAMS["g"] / 2 * 0.1**2 / 2, rtol=1e-12)
+
+
+def test_the_default_step_expands_about_the_state_that_a_dense_one_does():
+    system, q0, v0 = chain()
+
+    def ends(k, **options):
+        params = PARAMS | {"k": k}
+        return hhtjax.simulate(system, hhtjax.hht(**options), q0, v0, params, dt=0.1, num_steps=6, save_every=6).q[-1]
+
+    k = jnp.array([20.0, 2e4])
+    found, dense = (jax.jit(jax.vmap(lambda k, o=o: ends(k, **o)))(k) for o in ({}, {"solve": by_lapack}))
+    np.testing.assert_allclose(found, dense, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(jax.jit(ends)(k[1]), dense[1], rtol=0, atol=1e-8)
+    elsewhere = jax.jit(lambda k: ends(k, linearize="predictor"))(k[1])
+    assert float(jnp.max(jnp.abs(elsewhere - dense[1]))) > 1e-3  # else no step of it was about the held state

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import compress
 
 import jax
 from jax.core import eval_jaxpr
+from jax.tree_util import Partial
 
-from hhtjax.description import PyTree
+from hhtjax.description import PyTree, is_concrete
 
 
 def hoisted(f: Callable, *args: PyTree):
@@ -40,3 +42,34 @@ def opened(f: Callable, *args: PyTree):
         return jax.tree.unflatten(jax.tree.structure(like), eval_jaxpr(trace.jaxpr, constants, *jax.tree.leaves(args)))
 
     return call, trace.consts
+
+
+def carried(f: Callable, *args: PyTree) -> Partial:
+    """f as a pytree of what is being traced among all that it closes over: for a loop that hands f on.
+
+    Args:
+        f: a function of pytrees of arrays; it runs once.
+        *args: these, or tracers of theirs.
+
+    Returns:
+        A `jax.tree_util.Partial` with the same values.
+
+    Raises:
+        whatever f raises.
+
+    >>> import jax, jax.numpy as jnp
+    >>> def root(x):
+    ...     f = carried(lambda y: x * y + jnp.arange(2.0), x)
+    ...     return len(jax.tree.leaves(f)) + jax.tree.map(jnp.square, f)(x)
+    >>> print(jax.jit(root)(3.0))
+    [28. 29.]
+    """
+    trace, like = jax.make_jaxpr(f, return_shape=True)(*args)
+    moves = [not is_concrete(x) for x in trace.consts]
+
+    def call(moving: list, *args: PyTree):
+        rest = iter(moving)
+        constants = [next(rest) if m else x for m, x in zip(moves, trace.consts, strict=True)]
+        return jax.tree.unflatten(jax.tree.structure(like), eval_jaxpr(trace.jaxpr, constants, *jax.tree.leaves(args)))
+
+    return Partial(jax.jit(call), list(compress(trace.consts, moves)))

@@ -110,11 +110,11 @@ class Expand:
         self.r, self.path, self.w = r, path, w
         self.predicted, self.other = staged(self._predicted, w.size), staged(self._other, w.size)
 
-    def __call__(self, at: State | None = None, first: Expansion | None = None) -> Expansion:
-        """The `Expansion`; first: that about path(w) where it is known, and with it the path."""
+    def __call__(self, at: State | None = None, known: tuple | None = None) -> Expansion:
+        """The `Expansion`; known: path(w) and the tangent of path, where they are."""
         if at is None:
             return Expansion(*self.predicted(self.w))
-        start, along = staged(self.path, self.w.size)(self.w) if first is None else (first.at, first.along)
+        start, along = staged(self.path, self.w.size)(self.w) if known is None else known
         value, tangent, here = self.other(start, at)
         return Expansion(value, at, tangent, along, here)
 
@@ -351,15 +351,18 @@ def linearized_step(
     def solution(expansion: Expansion):
         return solve_expanded(r, path, s.w, factorize, again, expansion)[:2]
 
-    def about(at: State | None, first: Expansion | None = None):
-        expansion = expand(at, first)
+    def about(at: State | None, known: tuple | None = None):
+        expansion = expand(at, known)
         return *solution(expansion), expansion
 
     D = system.with_ones(diagonal(system.mass(s.q, s.t, params)))
     limit = HELD_THRESHOLD**2 * jnp.sum(D * s.w**2)
     ways = path(s.w), held, lambda r: jnp.sum(r * (r / D)), limit
+    better = partial(better_solve, about)
+    if system.sparse is not None:
+        better = partial(better_solve_in_turn, about, lambda: expand.path(s.w))
     # derivatives by one expansion about the state that was chosen: through both they would take longer to compile
-    return derivative_of(lambda: about(better_state(r, *ways))[:2], lambda: better_solve(about, *ways[1:]))
+    return derivative_of(lambda: about(better_state(r, *ways))[:2], lambda: better(*ways[1:]))
 
 
 def linearize(f: Callable, x: Array | State):
@@ -386,10 +389,33 @@ def better_solve(about: Callable, held: State, size: Callable, limit: Array):
     predicted_size = size(first.here)
 
     def better(found: tuple):
-        w, info, expansion = about(held, first)
+        w, info, expansion = about(held, (first.at, first.along))
         return tree_where(predicted_size <= size(expansion.here), found, (w, info))
 
     return call_where(better, ~(predicted_size <= limit), (w, info))
+
+
+def better_solve_in_turn(about: Callable, first: Callable, held: State, size: Callable, limit: Array):
+    """The same by a loop that is gone through once or twice: a large program then holds one expansion, not two.
+
+    first: () -> path(w) and the tangent of path."""
+    known = start, _ = first()
+
+    def solve(at: State):
+        w, info, expansion = about(at, known)
+        return (w, info), size(expansion.here)
+
+    solved = traced(solve, held)
+
+    def visit(carry: tuple):
+        found, smallest, is_first, _ = carry
+        other, here = solved(tree_where(is_first, start, held))
+        found = tree_where(is_first | ~(smallest <= here), other, found)
+        return found, here, jnp.array(False), is_first & ~(here <= limit)
+
+    nothing = jax.tree.map(jnp.zeros_like, solved.result)
+    yes = jnp.array(True)
+    return lax.while_loop(lambda carry: carry[3], visit, (*nothing, yes, yes))[0]
 
 
 def refresh(system: FlatSystem, params: PyTree, c, s, factorize):

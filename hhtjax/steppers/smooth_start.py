@@ -39,10 +39,10 @@ from jax import lax
 from hhtjax.description import Array, PyTree
 from hhtjax.jaxpr import linear_map
 from hhtjax.numerics.batched_cond import call_where, derivative_at_need, tree_where
-from hhtjax.numerics.closures import hoisted
+from hhtjax.numerics.closures import carried, hoisted
 from hhtjax.numerics.dense_lu import UNROLLED, diagonal, differentiable_inverse, inverse, matvec
 from hhtjax.numerics.differentiable_while import implicit_root
-from hhtjax.numerics.linear_solve import Trusted, factorize_map, solve_map
+from hhtjax.numerics.linear_solve import Trusted, factorize_map, invert, solve_map
 from hhtjax.numerics.low_rank import around
 from hhtjax.numerics.shortened_newton import improved
 from hhtjax.primitives import one_kernel, staged, traced
@@ -315,13 +315,12 @@ def without_layer(
     """
     options = method.options
 
-    def by_maps(method: Stepper, data: PyTree, h: Array) -> Found:
+    def by_maps(find: Callable, method: Stepper, data: PyTree, h: Array) -> Found:
         known = layer.with_data(data)
         how = factors(method, known.system, known.params, known.V) if factorize is None else factorize
-        z = known.zeros() if known.system.linear or not damped else root(known, how)
-        inverse, z, at, tangent = newton_step(known, how, z)
-        drag, damps = damping(known, how, at, tangent)
-        return finish(method, known, inverse, drag if damped else None, z, h, corrects)._replace(damps=damps)
+        inverse, z, tangent = find(known, how)
+        drag, damps = damping(known, how, tangent) if damped else (None, None)
+        return finish(method, known, inverse, drag, z, h, corrects)._replace(damps=damps)
 
     def by_matrices(
         find: Callable, invert: Callable, method: Beginning | GeneralizedAlpha, data: PyTree, h: Array
@@ -339,7 +338,9 @@ def without_layer(
     data = layer.data()
     large = layer.zeros().size > (UNROLLED if layer.system.linear else LARGEST)
     if large or options.solve is not None or options.redundant is not None or layer.system.sparse is not None:
-        return by_maps(method, data, h)
+        if layer.system.linear or not damped:
+            return by_maps(lambda known, how: newton_step(known, how, known.zeros()), method, data, h)
+        return derivative_at_need(partial(by_maps, at_root), partial(by_maps, searched_by_maps), method, data, h)
     moving = partial(by_matrices, differentiable, differentiable_inverse)
     return derivative_at_need(moving, partial(by_matrices, searched, inverse), method, data, h)
 
@@ -382,8 +383,7 @@ def finished(
     lag = lag_left(layer, inverse)
     if not corrects:
         return Found(v, z, lag=lag)
-    dw, dL = layer.parts(z)
-    base = layer.base
+    (dw, dL), base = layer.parts(z), layer.base
     s = base._replace(v=v, w=base.w + dw, L=None if dL is None else base.L + dL)
     return Found(v, z, layer.parts(rate_of(layer, s, inverse, h))[0])
 
@@ -441,16 +441,55 @@ def differentiable(layer: Layer):
 
 
 def newton_step(layer: Layer, factorize: Callable | Given | Constant, z: Array):
-    """The solve with the matrix at z, the z that it leads to, the state there, and the tangent of the rows."""
+    """The solve with the matrix at z, the z that it leads to, and the tangent of the rows."""
     at, along = jax.linearize(layer.path, z)
     value, tangent = linearize_rows(layer.rows, at)
     inverse = factorize_map(lambda dz: tangent(along(dz)), value, around(factorize, lambda: (at, along)))
-    return inverse, z - inverse(value), at, tangent
+    return inverse, z - inverse(value), tangent
 
 
-def damping(layer: Layer, factorize: Callable | Given | Constant, at: State, tangent: Callable):
+def at_root(layer: Layer, factorize: Callable | Given | Constant):
+    """The same where Newton's method ends; differentiated by the implicit-function theorem."""
+    n = layer.system.size
+
+    def f(z):
+        return layer.rows(layer.path(z))
+
+    def search(z):
+        def around_it(z):
+            value, tangent = linearized(f, z)
+            dz = factorize_map(tangent, value, around(factorize, lambda: jax.linearize(layer.path, z)))(value)
+            return dz, jnp.abs(jnp.sum(dz[:n] * value[:n]))
+
+        return improved(around_it, z)[0], None
+
+    def tangent_solve(g, y):
+        return solve_map(g, y, factorize)
+
+    return newton_step(layer, factorize, implicit_root(f, layer.zeros(), search, tangent_solve)[0])
+
+
+def searched_by_maps(layer: Layer, factorize: Callable | Given | Constant):
+    """The same as `at_root`, without derivatives: its loop hands on the maps found last, so that none is twice."""
+    n = layer.system.size
+
+    def around_it(z: Array):
+        at, along = jax.linearize(layer.path, z)
+        value, tangent = linearize_rows(layer.rows, at)
+        inverse = invert(lambda dz: tangent(along(dz)), value, around(factorize, lambda: (at, along)))
+        dz = inverse(value, trans=0)
+        maps = carried(partial(inverse, trans=0), z), carried(tangent, at)
+        return dz, jnp.abs(jnp.sum(dz[:n] * value[:n])), *maps
+
+    step = traced(around_it, layer.zeros())
+    z, dz, inverse, tangent = improved(step, layer.zeros(), *jax.tree.map(jnp.zeros_like, step.result[2:]))
+    return inverse, z - dz, tangent
+
+
+def damping(layer: Layer, factorize: Callable | Given | Constant, tangent: Callable):
     """The map (C + C^T)/2 at a state, and whether it is anything but 0."""
-    zero, v = jax.tree.map(jnp.zeros_like, at), layer.base.v
+    v = layer.base.v
+    zero = jax.tree.map(jnp.zeros_like, jax.eval_shape(layer.path, layer.zeros()))
 
     def drag(x: Array) -> Array:
         return tangent(zero._replace(v=layer.located(x)))[: v.size]
@@ -559,24 +598,3 @@ def rate_of(layer: Layer, s: State, inverse: Callable, h: Array) -> Array:
 
     before, after = lax.map(rows, jnp.stack([jnp.zeros_like(h), LATER * h]))
     return corrected_by(layer, inverse, (after - before) / (LATER * h))
-
-
-def root(layer, factorize):
-    """z behind the implicit step; differentiated by the implicit-function theorem."""
-    n = layer.system.size
-
-    def f(z):
-        return layer.rows(layer.path(z))
-
-    def search(z):
-        def around_it(z):
-            value, tangent = linearized(f, z)
-            dz = factorize_map(tangent, value, around(factorize, lambda: jax.linearize(layer.path, z)))(value)
-            return dz, jnp.abs(jnp.sum(dz[:n] * value[:n]))
-
-        return improved(around_it, z)[0], None
-
-    def tangent_solve(g, y):
-        return solve_map(g, y, factorize)
-
-    return implicit_root(f, layer.zeros(), search, tangent_solve)[0]
