@@ -81,12 +81,14 @@ class Plan:
 
     def inverse(self, A: Numbers | Blocks) -> Callable:
         """(b, trans=0) -> A^-1 b, or A^-T b."""
-        return self._by_blocks(A) if self.is_in_blocks else self._by_superlu(A)
+        if isinstance(A, Blocks) or self.is_in_blocks:
+            return self._by_blocks(A)
+        return self._by_superlu(A)
 
-    def pivots(self, A: Numbers, limit: float) -> Array:
+    def pivots(self, A: Numbers | Blocks, limit: float) -> Array:
         """(n,): of the elimination without exchanges of a symmetric matrix, whose diagonal is made 1; what is divided
         by is not less than `limit`."""
-        if not self.is_in_blocks:
+        if not (isinstance(A, Blocks) or self.is_in_blocks):
             sparse = self._sparse(A)
             d = sparse.diagonal()
             return pivots_on_host(_scaled_on_both_sides(sparse, 1 / jnp.sqrt(jnp.where(d > 0, d, 1))), limit)
@@ -165,7 +167,7 @@ class Plan:
     def _in_blocks(self, A: Numbers | Blocks) -> Blocks:
         return A if isinstance(A, Blocks) else Blocks(*_added(A, self.entry_in_blocks))
 
-    def _by_blocks(self, A: Numbers) -> Callable:
+    def _by_blocks(self, A: Numbers | Blocks) -> Callable:
         blocks = self._in_blocks(A)
         N, b = blocks.middle.shape[:2]
         free = np.ones((N, b), bool)
