@@ -131,6 +131,9 @@ UNSUPPORTED = {
     "callback": lambda c: jax.pure_callback(np.sin, jax.ShapeDtypeStruct(c.shape, c.dtype), c),
     "dot_general": lambda c: jnp.sum(jnp.ones((40, 40)) @ jnp.ones((40, 40)) * c[0], 1)[:4] / 999,
     "an index of 4096": lambda c: c / 2 + jnp.argmax(jnp.sin(jnp.arange(4096.0) * c[0])) / 9999,
+    "a long product of another dtype": lambda c: (
+        c / 2 + jnp.dot(*[(jnp.arange(4096.0) * c[0]).astype("float32")] * 2, preferred_element_type=float) / 1e12
+    ),
     "4096 running sums": lambda c: c / 2 + jnp.cumsum(jnp.sin(jnp.arange(4096.0) * c[0]))[-1] / 9999,
 }
 

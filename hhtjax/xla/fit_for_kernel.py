@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.extend.core import Literal
 
 from hhtjax.jaxpr.scalar_rules import ELEMENTWISE
@@ -22,7 +23,12 @@ if TYPE_CHECKING:
 
 LARGEST_SUM = 4095  # numbers of a sum; XLA hands larger ones to another library
 FEW_TERMS = 32  # of a sum over an axis, up to which it is written out where the array is large
-LARGE = {"reduce_sum", "reduce_prod", "reduce_max", "reduce_min"}  # that are written in parts where the array is large
+REDUCTIONS = {  # written in parts where the array is large: what combines two numbers, and many
+    "reduce_sum": (lax.add, jnp.sum),
+    "reduce_prod": (lax.mul, jnp.prod),
+    "reduce_max": (lax.max, jnp.max),
+    "reduce_min": (lax.min, jnp.min),
+}
 LARGEST_MATRIX = 4096  # elements of one that meets a vector
 # of a kernel with more, compiling takes longer than 20 s, or fails: on one core 3 s for 4,700, 7 s for 8,500, 18 s for
 # 13,900; gradients and branches take .2 to 1.2 ms an operation
@@ -136,7 +142,7 @@ def _objection(eqn, name: str):
 
 def is_large_reduction(eqn) -> bool:
     """Whether it is a sum, or the like, of so many numbers that for_kernel.py writes it in parts."""
-    if eqn.primitive.name not in LARGE:
+    if eqn.primitive.name not in REDUCTIONS:
         return False
     x = eqn.invars[0].aval
     return x.size > LARGEST_SUM and np.issubdtype(x.dtype, np.floating)

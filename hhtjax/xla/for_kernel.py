@@ -1,7 +1,8 @@
 """A jaxpr as a kernel needs it: with other operations in the place of those that XLA:CPU's emitter does not know.
 
-Products of small matrices become sums, scatters of few windows updates, sines of float64 numbers polynomials; of a
-function in two forms (`choose`) the one for kernels is taken. All else is copied as it is, without being traced again.
+Products of small matrices become sums, large sums those of parts, scatters of few windows updates, sines of float64
+numbers polynomials; of a function in two forms (`choose`) the one for kernels is taken. All else is copied as it is,
+without being traced again.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from hhtjax.xla.fit_for_kernel import (
     DTYPES,
     FEW_TERMS,
     LARGEST_SUM,
+    REDUCTIONS,
     is_large_reduction,
     is_of_vector,
     lengths,
@@ -50,12 +52,6 @@ COMBINED = {"scatter": lambda before, given: given} | {
     f"scatter-{name}": getattr(lax, name) for name in ("add", "sub", "mul", "min", "max")
 }
 LEAST = 6  # operations of a stage that is a kernel; fewer are one fusion or two anyway
-REDUCTIONS = {  # what combines two numbers, and many
-    "reduce_sum": (lax.add, jnp.sum),
-    "reduce_prod": (lax.mul, jnp.prod),
-    "reduce_max": (lax.max, jnp.max),
-    "reduce_min": (lax.min, jnp.min),
-}
 LARGEST = 8192  # numbers of an array; XLA may divide the work on larger ones among threads
 IDLE = {"broadcast_in_dim"}  # what a branch may hold that has nothing to do
 MANY = 4  # values of a conditional: of fewer, a loop is no better
@@ -239,9 +235,14 @@ def _traced(f: Callable, avals: Sequence) -> ClosedJaxpr:
 def _is_to_write_out(eqn) -> bool:
     """Of two matrices, or of large arrays, with few terms."""
     terms, *sides = lengths(eqn)
-    types = {x.aval.dtype for x in (*eqn.invars, *eqn.outvars)}
     few = 0 < terms <= MOST_TERMS and min(sides) <= MOST_ROWS
-    return few and (min(sides) > 1 or not is_of_vector(eqn)) and len(types) == 1 and types <= EXACT
+    return few and (min(sides) > 1 or not is_of_vector(eqn)) and _is_of_one_type(eqn)
+
+
+def _is_of_one_type(eqn) -> bool:
+    """Whether factors and result have one dtype, in which sums are exact enough."""
+    types = {x.aval.dtype for x in (*eqn.invars, *eqn.outvars)}
+    return len(types) == 1 and types <= EXACT
 
 
 @lru_cache(maxsize=256)
@@ -265,7 +266,8 @@ def _product(avals: tuple, dimension_numbers: tuple) -> ClosedJaxpr:
 
 def _is_of_long_vectors(eqn) -> bool:
     """A product of vectors, or a batch of them, that is too long a sum."""
-    return max(lengths(eqn)[1:]) == 1 and max(x.aval.size for x in eqn.invars) > LARGEST_SUM
+    is_long = max(lengths(eqn)[1:]) == 1 and max(x.aval.size for x in eqn.invars) > LARGEST_SUM
+    return is_long and _is_of_one_type(eqn)
 
 
 def _product_of_vectors(dimension_numbers: tuple, x: Array, y: Array) -> Array:
