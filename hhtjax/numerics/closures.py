@@ -64,12 +64,11 @@ def carried(f: Callable, *args: PyTree) -> Partial:
     >>> print(jax.jit(root)(3.0))
     [28. 29.]
     """
-    trace, like = jax.make_jaxpr(f, return_shape=True)(*args)
-    moves = [not is_concrete(x) for x in trace.consts]
+    call, constants = opened(f, *args)
+    moves = [not is_concrete(x) for x in constants]
 
-    def call(moving: list, *args: PyTree):
+    def call_with(moving: list, *args: PyTree):
         rest = iter(moving)
-        constants = [next(rest) if m else x for m, x in zip(moves, trace.consts, strict=True)]
-        return jax.tree.unflatten(jax.tree.structure(like), eval_jaxpr(trace.jaxpr, constants, *jax.tree.leaves(args)))
+        return call([next(rest) if m else x for m, x in zip(moves, constants, strict=True)], *args)
 
-    return Partial(jax.jit(call), list(compress(trace.consts, moves)))
+    return Partial(jax.jit(call_with), list(compress(constants, moves)))

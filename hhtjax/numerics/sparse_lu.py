@@ -124,10 +124,8 @@ class Plan:
         return Blocks(at(-1), at(0), at(1))
 
     def _rows_of(self, x: Array) -> Array:
-        """(..., N, b) of (..., n): unknowns as the blocks have them."""
-        columns = [np.flatnonzero(self.place == k) for k in range(self.blocks.size)]
-        columns = [i[np.argsort(self.block[i])] for i in columns]
-        N = len(self.blocks.starts) - 1
+        """(..., N, b) of (..., n): unknowns as full blocks have them."""
+        columns, N = self.unknowns.T, len(self.unknowns)
         if all(np.array_equal(i, i[0] + np.arange(N) * (i[1] - i[0])) and i[1] > i[0] for i in columns):
             return jnp.stack([x[..., i[0] : i[-1] + 1 : i[1] - i[0]] for i in columns], axis=-1)
         return jnp.stack([x.at[..., i].get(mode="promise_in_bounds") for i in columns], axis=-1)
@@ -153,6 +151,13 @@ class Plan:
         return (self.block * self.blocks.size + self.place).astype(np.int32)
 
     @cached_property
+    def unknowns(self) -> np.ndarray:
+        """(N, b): which unknown is where in the blocks; n where a place is empty."""
+        found = np.full((len(self.blocks.starts) - 1, self.blocks.size), self.n, np.int32)
+        found.ravel()[self.there] = np.arange(self.n, dtype=np.int32)
+        return found
+
+    @cached_property
     def entry_in_blocks(self) -> np.ndarray:
         """(3, N, b, b): which entries the blocks before, on and behind the diagonal have. Behind the last entry are a
         0, for those that are none, and a 1, for the diagonal of places that are left empty."""
@@ -169,13 +174,11 @@ class Plan:
 
     def _by_blocks(self, A: Numbers | Blocks) -> Callable:
         blocks = self._in_blocks(A)
-        N, b = blocks.middle.shape[:2]
-        free = np.ones((N, b), bool)
-        free.ravel()[self.there[self.free :]] = False
+        N, b = self.unknowns.shape
+        free = (self.unknowns < self.free) | (self.unknowns == self.n)
         scale = _row_scale(blocks, free)
         factors = part(factorize_blocks)(*(x * scale[:, :, None] for x in blocks))
-        here = np.full(N * b, self.n, np.int32)
-        here[self.there] = np.arange(self.n, dtype=np.int32)
+        here = self.unknowns.ravel()
         in_order = np.array_equal(here, np.arange(self.n))
 
         def solve(x: Array, trans: int = 0) -> Array:

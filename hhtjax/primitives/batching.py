@@ -321,6 +321,7 @@ def _needed(used: list, *more: JaxprEqn):
 
 
 def values(asked: Array, *args: Array, closed: ClosedJaxpr, **params: PyTree):
+    """What the function of `in_turn` gives, whoever has asked."""
     return _evaluated(closed, *args)
 
 

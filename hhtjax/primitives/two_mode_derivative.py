@@ -99,16 +99,19 @@ def _divided(args: tuple, count: int):
 
 
 def both(*args, ways: TwoWays, count: int):
+    """The values of a function with two ways to its derivative, and then its tangents."""
     values, dots = ways.forward(*_divided(args, count))
     return [*values, *dots]
 
 
 def linear(*args, ways: TwoWays, count: int, backwards: bool):
+    """Its tangents alone, or, backwards, its cotangents: what is linear in it."""
     x, given = _divided(args, count)
     return ways.reverse(x, given) if backwards else ways.forward(x, given)[1]
 
 
 def values(*x: Array, f: Callable):
+    """Its values alone."""
     return f(list(x))
 
 
