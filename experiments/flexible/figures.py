@@ -104,7 +104,7 @@ def slider_crank(report: Any, points: list[dict]) -> None:
 
 def accuracy(report: Any, parts: dict[str, list[dict]]) -> None:
     """Error of the tip against seconds, a panel for each scene."""
-    figure, panels = subplots(1, len(parts), width=170, height=80)
+    figure, panels = subplots(1, len(parts), width=170, height=85)
     names = list(dict.fromkeys(row["way"] for rows in parts.values() for row in rows))
     for axes, (scene, rows) in zip(np.atleast_1d(panels), parts.items(), strict=True):
         for i, way in enumerate(names):
@@ -113,7 +113,8 @@ def accuracy(report: Any, parts: dict[str, list[dict]]) -> None:
                 x, y = [row["seconds"] for row in mine], [row["tip_error_m"] for row in mine]
                 axes.loglog(x, y, color=COLOURS[i], marker=MARKERS[i], label=way)
         axes.set(xlabel="time of a run (s)", ylabel="error of the tip (RMS, m)", title=scene)
-    np.atleast_1d(panels)[0].legend(loc="lower left", fontsize=7)
+    entries = np.atleast_1d(panels)[0].get_legend_handles_labels()
+    figure.legend(*entries, loc="outside lower center", ncols=5, fontsize=7)
     report.figure("flexible_accuracy", figure)
 
 
