@@ -20,7 +20,7 @@ from hhtjax.numerics.batched_cond import if_any, tree_where
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.primitives import in_turn
 from hhtjax.runs.event_step import EventContext, EventState, Pieces, SubStep, asks, pass_events, reaching, unnoted
-from hhtjax.runs.solution import FINE, INTERNAL_STATE, Failure, Log, Solution
+from hhtjax.runs.solution import FINE, INTERNAL_STATE, ContactForces, Failure, Log, Solution
 from hhtjax.steppers.friction_switching import is_settled
 from hhtjax.steppers.stepper import Info, bound, entered, join_info, public, step_start
 from hhtjax.steppers.variable_step import resized_step
@@ -193,7 +193,7 @@ def resting(advance: Callable, by_itself: bool, run: tuple, info: Info, here: Ar
 def saved(flat: FlatSystem, state: State):
     """What a run saves of a state."""
     state = public(flat, state)
-    return state.t, state.q, state.v, state.w, state.L, state.z, state.zdot, state.friction
+    return state.t, state.q, state.v, state.w, state.L, state.z, state.zdot, state.friction, state.contact
 
 
 def as_solution(
@@ -206,12 +206,14 @@ def as_solution(
 
 def as_path(flat, path: tuple) -> Solution:
     """What was saved, with a leading axis, as a `Solution` that knows nothing else."""
-    t, q, v, w, L, *z, friction = path
+    t, q, v, w, L, *z, friction, contact = path
     q = jax.vmap(flat.unravel)(q)
     v, w = (None if x is None else jax.vmap(flat.unravel_rates)(x) for x in (v, w))
     z, zdot = (None if x is None else jax.vmap(flat.unravel_internal)(x) for x in z)
     nothing: Any = None
     solution = Solution(t, q, v, w, L, nothing, nothing, nothing, z, zdot)
+    if contact is not None:
+        return solution._replace(contact=ContactForces.of(contact))
     return solution if friction is None else solution._replace(friction=friction.tau, sticking=friction.sig == 0)
 
 
@@ -234,12 +236,14 @@ def flaw_at_start(system, flat, start, params: PyTree):
 def no_failure(info: Info) -> Failure:
     """What `Solution.failure` says of a run in which all went well."""
     none = jnp.zeros((), jnp.int32)
-    return Failure(none, jnp.array(False), none, info.dependent_row, info.solve_residual, info.friction)
+    return Failure(
+        none, jnp.array(False), none, info.dependent_row, info.solve_residual, info.friction, contact=info.contact
+    )
 
 
 def first_failure(flat: FlatSystem, failure: Failure, count: Array, state: State, info: Info) -> Failure:
     """The failure so far, or this step's. Of several quantities an internal state is named, then the first."""
-    _, *values, _ = saved(flat, state)
+    _, *values, _, _ = saved(flat, state)
     known = [(i, x) for i, x in enumerate(values) if x is not None]
     known.sort(key=lambda x: x[0] < INTERNAL_STATE)
     # a sum that is finite tells that all are; where it is not, look closer
@@ -252,7 +256,7 @@ def told_failure(info: Info) -> Array:
     failed = jnp.array(False) if info.dependent_row is None else info.dependent_row >= 0
     for well in (info.converged, info.solved):
         failed = failed if well is None else failed | ~well
-    return failed
+    return failed if info.contact is None else failed | (info.contact > 0)
 
 
 def failure_of(known: list, count: Array, info: Info, failure: Failure) -> Failure:
@@ -261,13 +265,15 @@ def failure_of(known: list, count: Array, info: Info, failure: Failure) -> Failu
     for i, x in reversed(known):
         fine = jnp.all(jnp.isfinite(x))
         quantity, finite = jnp.where(fine, quantity, i), finite & fine
-    newton, row, left, friction = finite, failure.row, failure.solve, failure.friction
+    newton, row, left, friction, contact = finite, failure.row, failure.solve, failure.friction, failure.contact
     if info.dependent_row is not None:
         newton = newton & (info.dependent_row < 0)
     if info.solved is not None:
         newton = newton & info.solved
     if info.friction is not None:
         newton = newton & is_settled(info.friction)
+    if info.contact is not None:
+        newton = newton & (info.contact == 0)
     first = (~finite | told_failure(info)) & (failure.step == 0)
     if info.dependent_row is not None:
         row = jnp.where(first, info.dependent_row, failure.row)
@@ -275,8 +281,10 @@ def failure_of(known: list, count: Array, info: Info, failure: Failure) -> Failu
         left = jnp.where(first & finite & ~info.solved, info.solve_residual, failure.solve)
     if info.friction is not None:
         friction = jnp.where(first & ~is_settled(info.friction), info.friction, failure.friction)
+    if info.contact is not None:
+        contact = jnp.where(first, info.contact, failure.contact)
     step, quantity = (jnp.where(first, new, old) for new, old in ((count, failure.step), (quantity, failure.quantity)))
-    return Failure(step, jnp.where(first, newton, failure.newton), quantity, row, left, friction)
+    return Failure(step, jnp.where(first, newton, failure.newton), quantity, row, left, friction, contact=contact)
 
 
 def neutral_info(shapes: Info) -> Info:

@@ -20,6 +20,7 @@ from hhtjax.systems.matrices import INDEFINITE, MASSLESS, OF_VELOCITY
 
 if TYPE_CHECKING:
     from hhtjax.runs.error_control import Steps
+    from hhtjax.steppers.stepper import ContactState
 
 
 class FailedRunWarning(RuntimeWarning):
@@ -28,6 +29,30 @@ class FailedRunWarning(RuntimeWarning):
 
 class SimulationError(RuntimeError):
     """A run in which a step failed; raised by `Solution.check`."""
+
+
+@shown
+class ContactForces(NamedTuple):
+    """What contacts do at the saved times.
+
+    Attributes:
+        normal: (K + 1, m), the forces that press bodies apart, N; 0 where they do not touch.
+        friction: (K + 1, m), those along the surfaces, positive against negative sliding.
+        closed: (K + 1, m), whether bodies touch.
+        sticking: (K + 1, m), whether they also stick.
+    """
+
+    normal: Array
+    friction: Array
+    closed: Array
+    sticking: Array
+
+    @classmethod
+    def of(cls, contact: ContactState) -> ContactForces:
+        """Those of a state of a step."""
+        m = contact.closed.shape[-1]
+        closed = contact.closed > 0
+        return cls(contact.f[..., :m], contact.f[..., m:], closed, closed & (contact.sig == 0))
 
 
 @shown
@@ -46,6 +71,7 @@ class Failure(NamedTuple):
         mass: what is wrong with a mass that is a function, at the start: 0 nothing, 1 it is not symmetric, 2 not
             positive definite (with constraints: not positive semidefinite); None where the mass is constant.
         event: what went wrong at an event, 0 nothing; None without events. guard: the number of that event.
+        contact: `info.contact`, what went wrong with contacts, 0 nothing; None without.
     """
 
     step: Any
@@ -57,6 +83,7 @@ class Failure(NamedTuple):
     mass: Any = None
     event: Real = None
     guard: Real = None
+    contact: Any = None
 
     def _verdict(self) -> str:
         """How many failed, or what did."""
@@ -86,6 +113,15 @@ QUANTITIES = (
     "the internal state z", "the rate of the internal state z",
 )  # fmt: skip
 MASS = (None, "symmetric", "positive definite", "the same at all velocities")
+CONTACT = {  # what went wrong with contacts, by the code of a step
+    1: "no contact forces were found that neither pull nor hold more than friction allows. Take a smaller dt, or less "
+    "`friction`",
+    2: "contacts let go, stick and slide too often within the step. Take a smaller dt",
+    3: "a contact jams: with so much friction, more normal force presses the bodies together (Painleve). Take less "
+    "`friction`, or compliance in `force`",
+    4: "bodies touch that were apart, and go through each other: impacts are not solved yet. Take an `Event` with "
+    "terminal=True, and go on from there",
+}
 WAYS = {
     INDEFINITE: f". {MASSLESS}",
     OF_VELOCITY: ": from_lagrangian takes energies that are quadratic in v. Write others as a System(mass, force)",
@@ -109,6 +145,7 @@ class Solution(NamedTuple):
         z, zdot: internal states and their rates, like z0 with a leading axis K + 1; None without.
         friction: tau (K + 1, m), dry friction, positive against positive sliding; None without.
         sticking: (K + 1, m), whether a joint sticks; None without.
+        contact: `ContactForces`, what contacts do; None without.
         steps: what error control chose, the `Steps`; dt are those accepted. None without.
         error: (K + 1,) of a run with `adaptive(verify=)`, that of q at each saved time, in its largest coordinate.
         failed: whether the run failed, a property; (B,) of a batch: which members did.
@@ -130,6 +167,7 @@ class Solution(NamedTuple):
     zdot: PyTree = None
     friction: Any = None
     sticking: Array | None = None
+    contact: Any = None
     steps: Steps | None = None
     error: Any = None
     allowed: Any = None
@@ -218,6 +256,7 @@ class Solution(NamedTuple):
         """The run in a line, and its arrays."""
         rows = leaf_rows(q=self.q, v=self.v, acceleration=self.acceleration, multipliers=self.multipliers)
         rows += leaf_rows(z=self.z, zdot=self.zdot, friction=self.friction, sticking=self.sticking)
+        rows += leaf_rows(contact=self.contact)
         rows += leaf_rows(output=self.output)
         return Table(f"Solution: {self._title()}", [["", "shape", "dtype"], *rows, *leaf_rows(info=self.info)])
 
@@ -245,7 +284,7 @@ class Solution(NamedTuple):
     def _why(self, member: tuple) -> str:
         """What `failure` says of one member of a batch."""
         found = (0 if x is None else np.asarray(x)[member] for x in self.failure)
-        _, newton, quantity, row, left, friction, mass, event, guard = found
+        _, newton, quantity, row, left, friction, mass, event, guard, contact = found
         if mass:
             way = WAYS.get(int(mass), "")
             return f"`mass` must be {MASS[mass]}; at the start it is not{way}"
@@ -259,6 +298,8 @@ class Solution(NamedTuple):
                 "conjugate_gradients(), or another solve(A, b); a larger `tolerance` of these accepts it. With sparse "
                 "matrices M, C and K are too far apart in size for this step, or for float32"
             )
+        if contact:
+            return CONTACT[float(contact)]
         if np.isinf(friction):
             return "a limit of the dry friction is negative or not finite: see `friction` of the System"
         if friction == DEPENDENT:

@@ -122,7 +122,7 @@ def bind_friction(method, system, params: PyTree, dt, kept: Changing | None = No
     driven = method.redundant is None and system.num_constraints >= system.positions
 
     def step(s):
-        r, path, z, shift, B = _equations(method, system, params, dt, s)
+        r, path, z, shift, B = equations_of(method, system, params, dt, s)
         stops, at = _foreseen(system, params, dt, s, path(z), driven)
         sig, tau = s.friction
         smooth = jnp.where(stops, 0, sig)
@@ -135,12 +135,12 @@ def bind_friction(method, system, params: PyTree, dt, kept: Changing | None = No
         factorize = method.factorize_for(system) if system.num_constraints else method.factorize
         if kept is not None:
             factorize = _with_slope(kept, system, smooth, at, params)
-        z, info, inverse, along = _free_step(method.options, system, rubbing, path, z, s, factorize, at)
+        z, info, inverse, along = free_step(method.options, system, rubbing, path, z, s, factorize, at)
         H = directions(system, at.q, at.t, params)
-        G = _each(inverse, jnp.pad(H, ((0, 0), (0, z.size - size))))
+        G = each_row(inverse, jnp.pad(H, ((0, 0), (0, z.size - size))))
         pulls = G[:, size : size + system.num_constraints]
         rows = rows_of(system, at.q, at.t, params, H, G[:, :size], pulls, sig == 0, dependent)
-        W = across(H, _each(along, G).v)
+        W = across(H, each_row(along, G).v)
 
         def sliding(z):
             return law.sliding(at.q, path(z).v, at.t, params)  # with H as in W
@@ -169,7 +169,7 @@ def bind_friction(method, system, params: PyTree, dt, kept: Changing | None = No
     return step
 
 
-def _equations(method, system, params: PyTree, dt, s):
+def equations_of(method, system, params: PyTree, dt, s):
     """As for constraints, also without."""
     if system.num_constraints:
         return equations(method, system, params, dt, s)
@@ -203,7 +203,7 @@ def _with_slope(kept, system, sig: Array, at, params: PyTree) -> Updated:
     return Updated(kept, directions(system, at.q, at.t, params), slope)
 
 
-def _free_step(
+def free_step(
     options: Options,
     system: FlatSystem,
     r: Callable,
@@ -309,7 +309,7 @@ def _taken_off(x: Array, y: Array, G: Array) -> Array:
     return jnp.where(jnp.abs(left) < noise, 0, left)
 
 
-def _each(f: Callable, rows):
+def each_row(f: Callable, rows):
     """f of each row; without vmap of a single one, which leaves less to compile."""
     if len(rows) == 1:
         return jax.tree.map(lambda x: x[None], f(rows[0]))

@@ -17,6 +17,7 @@ from hhtjax.numerics.linear_solve import Structured, factorize_with
 from hhtjax.numerics.sparse_lu import SparseLU
 from hhtjax.numerics.structured_solve import Detected
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
+from hhtjax.steppers.contact import begin_contact, bind_contact
 from hhtjax.steppers.friction import begin_friction, bind_friction, smoothed_friction
 from hhtjax.steppers.implicit_solve import (
     factorized_once,
@@ -78,6 +79,7 @@ class GeneralizedAlpha(Controlled, Stepper):
     solves_rotations = True
     solves_internal = True
     solves_friction = True
+    solves_contact = True
     meets_events = True
     keeps_sparse = True
     corrections = DEFAULT  # of the smooth start
@@ -88,6 +90,8 @@ class GeneralizedAlpha(Controlled, Stepper):
         if system.matrices is not None and not (given is None or isinstance(given, Structured)):
             raise NotImplementedError(f"hht: leave out `solve` with sparse matrices; received {given!r}.")
         system = self.seen(system, params, q.dtype)
+        if system.contact is not None:
+            return begin_contact(self, system, q, v, t, params, dt)
         if system.friction is not None:
             return begin_friction(self, system, q, v, t, params, dt)
         if system.num_constraints:
@@ -107,6 +111,8 @@ class GeneralizedAlpha(Controlled, Stepper):
     ) -> State:
         """The state from which the first step goes, by `start`."""
         if self.options.start == "simple" or not system.positions or (resolves and not self.corrects(system)):
+            return state
+        if system.contact is not None:
             return state
         smooth = smoothed if system.friction is None else smoothed_friction
         system = self.seen(system, params, state.q.dtype)
@@ -223,6 +229,8 @@ class GeneralizedAlpha(Controlled, Stepper):
     def bind(self, system: FlatSystem, params: PyTree, dt: Array):
         """The step; for a linear system its matrix is factorised here, once."""
         system = self.seen(system, params, dt.dtype)
+        if system.contact is not None:
+            return bind_contact(self, system, params, dt)
         if system.friction is not None:
             return bind_friction(self, system, params, dt, linear_part(self, system, params, dt))
         if system.num_constraints:

@@ -36,6 +36,7 @@ class State(NamedTuple):
         z, zdot, za: internal states, their rates and their algorithmic rates, None without.
         L: multipliers (m,) of constraints, None without.
         friction: `FrictionState`, the directions of sliding and the forces of dry friction, None without.
+        contact: `ContactState`, None without.
         memory: whatever else a method carries on, on vectors; None where there is nothing.
     """
 
@@ -50,6 +51,22 @@ class State(NamedTuple):
     zdot: PyTree = None
     za: PyTree = None
     friction: PyTree = None
+    contact: PyTree = None
+
+
+@shown
+class ContactState(NamedTuple):
+    """What a step remembers of contacts.
+
+    Attributes:
+        f: (2 m,), the forces: normal ones, positive where they push, then those along the surfaces.
+        closed: (m,), 1 where bodies touch, else 0.
+        sig: (m,), the direction in which a closed contact slides: -1, 1, or 0 where it sticks.
+    """
+
+    f: Array
+    closed: Array
+    sig: Array
 
 
 @shown
@@ -87,6 +104,7 @@ class Info(NamedTuple):
             where a limit is negative or not finite, and 2 where directions of friction came to depend on each other.
         defect: S^-1 r, what a linearised step has left of its residual at its end, as a correction of the unknowns
             (under error control only).
+        contact: 0, or the code of what went wrong with contacts.
         switched: by how much dry friction that switched has changed the accelerations (alike).
     """
 
@@ -99,6 +117,7 @@ class Info(NamedTuple):
     solve_residual: Real = None
     solved: Array | None = None
     friction: Any = None
+    contact: Any = None
     defect: Array | None = None
     switched: Array | None = None
 
@@ -142,6 +161,7 @@ class Stepper(Description):
     solves_rotations = False
     solves_internal = False
     solves_friction = False
+    solves_contact = False
     keeps_sparse = False  # whether it never forms the matrix of a step of a system with sparse ones
     meets_events = False  # whether `begin` gives all that a step needs behind an event
     needs_equal_steps = False  # what it remembers belongs to steps of one size
@@ -238,7 +258,7 @@ class Stepper(Description):
         w = ravel_pytree((state.w if flat.positions else state.v, state.zdot))[0]
         a = None if state.a is None else ravel_pytree((state.a, state.za))[0]
         step = bound(self.astype(q.dtype), flat, params, jnp.asarray(dt).astype(q.dtype))
-        state, info = step(State(state.t, q, v, w, a, state.L, state.memory, friction=state.friction))
+        state, info = step(State(state.t, q, v, w, a, state.L, state.memory, friction=state.friction, contact=state.contact))
         return _unravel(flat, state), info
 
 
@@ -352,6 +372,8 @@ def require_capable(caller: str, system: AnySystem, stepper: Stepper, q0: PyTree
             f"{caller}: {name} cannot solve the `internal` states; use hht() or another of its family, "
             "a Rosenbrock method such as rodas5p(), rk4() or dopri5()."
         )
+    if system.contact is not None and not stepper.solves_contact:
+        raise NotImplementedError(f"{caller}: {name} cannot solve `contact`; use hht() or another of its family.")
     if system.friction is not None and not stepper.solves_friction:
         raise NotImplementedError(f"{caller}: {name} cannot solve dry `friction`; use hht() or another of its family.")
 

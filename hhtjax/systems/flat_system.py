@@ -21,6 +21,7 @@ from hhtjax.numerics.sparse_matrix import Sparse, combined
 from hhtjax.primitives import consistent
 from hhtjax.systems import kinematics
 from hhtjax.systems.assembly import ElementForce
+from hhtjax.systems.contact import FlatContact, flat_contact
 from hhtjax.systems.element_matrix import StepMatrix
 from hhtjax.systems.elements import parts_of
 from hhtjax.systems.friction import FrictionLaw, flat_friction
@@ -63,6 +64,7 @@ class FlatSystem(NamedTuple):
     balance: Callable | None = None  # q, v, w, t, params -> M w - Q (N,), where the system has it as one function
     local: Any = None  # the `Local` force beside a linear system
     friction: FrictionLaw | None = None  # dry friction, which `force` does not hold
+    contact: FlatContact | None = None  # contacts, alike
     matrices: Callable | None = None  # params -> M, C, K, where one of them is `Sparse`
     settle: Callable | None = None  # params -> the same system for these, its sparse matrices evaluated once
     diagonals: Callable | None = None  # params -> M, C, K (None where absent), where all of them are diagonals (n,)
@@ -265,6 +267,8 @@ def _flatten_second_order(caller: str, system, q0: PyTree, v0: PyTree, t0: Real,
         flat = _with_elements(caller, system, flat, q0, v0, t0, params)
     if system.friction is not None:
         flat = flat._replace(friction=flat_friction(caller, system, flat, q0, v0, z0, t0, params))
+    if system.contact is not None:
+        flat = flat._replace(contact=flat_contact(caller, system.contact, flat, q0, v0, t0, params, dtype))
     return flat, q, v
 
 

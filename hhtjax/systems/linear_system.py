@@ -135,6 +135,7 @@ class LinearSystem(Description):
 
     constraint = None
     internal = None
+    contact = None
     depending = False  # whether rows of `sliding` are known to depend on each other, or on constraints
 
     def mass(self, q: Array, params: PyTree):

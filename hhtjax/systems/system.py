@@ -18,6 +18,7 @@ from hhtjax.jaxpr import linear_map
 from hhtjax.primitives import traced
 from hhtjax.systems.assembly import put_together
 from hhtjax.systems.elements import Elements, Joints
+from hhtjax.systems.contact import Contact
 from hhtjax.systems.friction import require_friction
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import constant_matrix, require_mass
@@ -91,6 +92,7 @@ class System(Description):
             of `constraint`), or than 8, are taken to be dependent, and so are rows that the start shows to be. Rows
             of which only a tracer tells, or that become dependent later, are named by `check()`:
             `hht(redundant="least_squares")` is for these.
+        contact: a `Contact`: bodies that rest on each other, slide and let go. For the `hht` family.
 
     q and v are pytrees of the same structure and shapes; n is the number of entries of v. Only a rotation differs: a
     leaf R (..., 3, 3) of q, from material to spatial components, has the material angular velocity Om (..., 3) as its
@@ -152,6 +154,7 @@ class System(Description):
     friction: Callable | None = None
     sliding: Callable | None = None
     dynamics: Callable | None = None
+    contact: Contact | None = None
     massless = None  # of a `LinearSystem` alone
     depending = False  # whether rows of `sliding` are known to depend on each other, or on constraints
 
@@ -170,12 +173,24 @@ class System(Description):
         more = (self.internal is not None) * ("z",) + (self.constraint is not None) * ("L",)
         if self.friction is not None or self.sliding is not None:
             require_friction("System", self.friction, self.sliding, *more)
+        if self.contact is not None:
+            self._require_contact()
         if callable(self.mass):
             require_inertial("System", "mass", self.mass, ("q",))
         else:
             mass = constant_matrix("System", "mass", self.mass)
             require_mass("System", "mass", mass, self.constraint is not None)
             object.__setattr__(self, "mass", mass)
+
+    def _require_contact(self):
+        """An error for what is no contact, or stands beside dry friction."""
+        if not isinstance(self.contact, Contact):
+            raise TypeError(f"System: `contact` must be a Contact; received {self.contact!r}.")
+        if self.friction is not None:
+            raise NotImplementedError(
+                "System: leave out `friction` beside `contact`, whose own friction goes with its normal forces; dry "
+                "friction elsewhere can be a smooth force, such as F tanh(v/0.001), in `force`."
+            )
 
     def _take_apart(self):
         """`mass`, `force` and `inertia` by `dynamics`, for those who ask for one of them alone."""
@@ -352,6 +367,7 @@ class FirstOrderSystem(Description):
     constraint = None
     internal = None
     friction = None
+    contact = None
     massless = None
 
     def __post_init__(self):

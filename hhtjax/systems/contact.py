@@ -1,0 +1,172 @@
+"""Contact in one plane: where bodies touch, how they slide on each other, and what they do to the accelerations.
+
+    g = gap(q, t) >= 0,    s = sliding(q, v, t),    y = (dg/dt, s),    J = dy/dv
+    M(q) w = Q(q, v, t) + B^T L + J^T (f_N, f_T),    f_N >= 0,    f_N g = 0
+    f_T = -mu f_N sign(s) where s != 0,    |f_T| <= mu f_N where s = 0
+
+How a step finds f is in hhtjax/steppers/contact.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hhtjax.checks import count, describe, require_function, require_number
+from hhtjax.description import Array, Description, PyTree, Real, is_array, thaw
+from hhtjax.jaxpr import linear_map
+from hhtjax.primitives import consistent
+
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
+
+MOST = 4  # contacts
+
+
+@dataclass(frozen=True, eq=False)
+class Contact(Description):
+    """Contacts of bodies in a plane, for `System(contact=)`: they rest, stick, slide and let go.
+
+    Args:
+        gap: g, `gap(q, t, params)` -> (m,), or a number: the distances, m, positive where bodies are apart; smooth.
+            m <= 4.
+        sliding: s, `sliding(q, v, t, params)` -> (m,), or a number: the velocities along the surfaces, m/s, affine in
+            v. In one plane: a contact slides along one line.
+        friction: mu >= 0, Coulomb's: a number, (m,), the name of one in params, or a function of params. It needs
+            `sliding`.
+        restitution: e in [0, 1], the part of the normal impulse of compression that the expansion gives back (Poisson),
+            given as mu is.
+
+    The `hht` family solves it. Closed contacts are modes of its step: q, v and the forces are of order 2 through every
+    switch, and the gap is closed to rounding. Forces of contacts that depend on each other, such as friction at both
+    feet of a table, are determined in their sums alone.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind, or out of its range; friction without `sliding`.
+
+    >>> import hhtjax
+    >>> floor = hhtjax.Contact(gap=lambda q, t, params: q[1], sliding=lambda q, v, t, params: v[0], friction="mu")
+    >>> floor.friction
+    'mu'
+    """
+
+    gap: Callable
+    sliding: Callable | None = None
+    friction: Any = 0.0
+    restitution: Any = 0.0
+
+    def __post_init__(self):
+        require_function("Contact", "gap", self.gap, "gap(q, t, params)")
+        if self.sliding is not None:
+            require_function("Contact", "sliding", self.sliding, "sliding(q, v, t, params)")
+        _require_coefficient("friction", self.friction, lambda mu: mu >= 0, "not be negative")
+        _require_coefficient("restitution", self.restitution, lambda e: (e >= 0) & (e <= 1), "lie in [0, 1]")
+        if self.sliding is None and not (isinstance(self.friction, (int, float)) and self.friction == 0):
+            raise ValueError(
+                f"Contact: `friction` needs `sliding`, the velocity along the surface; received friction={self.friction!r}."
+            )
+
+
+def _require_coefficient(name: str, value, valid: Callable, expectation: str):
+    """An error for what is no number, array, name or function of params."""
+    if callable(value) and not is_array(value):
+        require_function("Contact", name, value, f"{name}(params)")
+    elif is_array(value) and jnp.ndim(value) == 1:
+        for x in value:
+            require_number("Contact", name, x, valid, expectation)
+    elif not isinstance(value, str):
+        require_number("Contact", name, value, valid, expectation)
+
+
+class FlatContact(NamedTuple):
+    """Contacts on vectors; made by `flat_contact`."""
+
+    gap: Callable  # q, t, params -> (m,)
+    sliding: Callable  # q, v, t, params -> (m,), affine in v; 0 where nothing rubs
+    friction: Callable  # params -> (m,)
+    restitution: Callable  # params -> (m,)
+    size: int  # m
+    rubs: bool  # whether there is a `sliding`
+
+
+def flat_contact(
+    caller: str, contact: Contact, flat: FlatSystem, q0: PyTree, v0: PyTree, t0: Real, params: PyTree, dtype: Any
+) -> FlatContact:
+    """The `FlatContact` of a system, or an error for what its functions return."""
+    m = _rows(caller, "gap", contact.gap, dtype, q0, t0, params)
+    if contact.sliding is not None:
+        rows = _rows(caller, "sliding", contact.sliding, dtype, q0, v0, t0, params)
+        if rows != m:
+            raise ValueError(f"{caller}: `sliding` must return ({m},), one velocity for each gap; received ({rows},).")
+
+    def gap(q: Array, t: Array, params: PyTree) -> Array:
+        return jnp.ravel(jnp.asarray(contact.gap(flat.unravel(q), t, thaw(params)))).astype(dtype)
+
+    def sliding(q: Array, V: Array, t: Array, params: PyTree) -> Array:
+        if contact.sliding is None:
+            return jnp.zeros(m, dtype)
+        v = flat.unravel_rates(flat.located(V))
+        return jnp.ravel(jnp.asarray(contact.sliding(flat.unravel(q), v, t, thaw(params)))).astype(dtype)
+
+    friction, restitution = (
+        partial(_coefficient, caller, name, getattr(contact, name), m, dtype) for name in ("friction", "restitution")
+    )
+    friction(params), restitution(params)  # their errors, at once
+    return FlatContact(consistent(gap), consistent(sliding), friction, restitution, m, contact.sliding is not None)
+
+
+def _rows(caller: str, name: str, function: Callable, dtype: Any, *args: PyTree) -> int:
+    """How many numbers it returns, or an error."""
+
+    def as_row(*args: PyTree) -> Array:
+        found = function(*args)
+        return found[None] if is_array(found) and jnp.ndim(found) == 0 else found
+
+    return count(caller, name, as_row, MOST, dtype, *args)
+
+
+def _coefficient(caller: str, name: str, given: Any, m: int, dtype: Any, params: PyTree) -> Array:
+    """(m,), from params."""
+    params = thaw(params)
+    if isinstance(given, str):
+        if not isinstance(params, dict) or given not in params:
+            raise ValueError(
+                f"{caller}: `{name}` is the name {given!r}, which params do not have; received {params!r}."
+            )
+        value = params[given]
+    else:
+        value = given(params) if callable(given) and not is_array(given) else given
+    if jnp.shape(value) not in ((), (m,)):
+        raise ValueError(f"{caller}: `{name}` must be a number or have shape ({m},); received {describe(value)}.")
+    return jnp.broadcast_to(jnp.asarray(value).astype(dtype), (m,))
+
+
+def rates(system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) -> Array:
+    """y = (dg/dt, s), (2 m,)."""
+    contact = system.contact
+    along = system.rate(q, v), jnp.ones_like(t)
+    gdot = jax.jvp(lambda q, t: contact.gap(q, t, params), (q, t), along)[1]
+    return jnp.concatenate([gdot, contact.sliding(q, v, t, params)])
+
+
+def directions(system: FlatSystem, q: Array, t: Array, params: PyTree) -> Array:
+    """J (2 m, N), the derivative of y in the rates."""
+    zero = jnp.zeros(system.size, q.dtype)
+    return linear_map(jax.linearize(lambda v: rates(system, q, v, t, params), zero)[1], zero)
+
+
+def reaction(system: FlatSystem, q: Array, t: Array, params: PyTree, f: Array) -> Array:
+    """J^T f: (N,)."""
+    zero = jnp.zeros(system.size, q.dtype)
+    return jax.vjp(lambda v: rates(system, q, v, t, params), zero)[1](f)[0]
+
+
+def rates_of_rates(system: FlatSystem, q: Array, v: Array, w: Array, t: Array, params: PyTree) -> Array:
+    """dy/dt, of the acceleration w: (2 m,)."""
+    along = system.rate(q, v), w, jnp.ones_like(t)
+    return jax.jvp(lambda q, v, t: rates(system, q, v, t, params), (q, v, t), along)[1]
