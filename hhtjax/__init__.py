@@ -84,8 +84,8 @@ from hhtjax.steppers.splitting import operator_splitting
 from hhtjax.steppers.stepper import Info, State, Stepper
 from hhtjax.steppers.taylor import taylor
 from hhtjax.systems import interop
-from hhtjax.systems.elements import Elements, Joints
 from hhtjax.systems.contact import Contact
+from hhtjax.systems.elements import Elements, Joints
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.initial_conditions import ConsistentInitial, PrecisionWarning, consistent_initial
 from hhtjax.systems.matrices import sparse
@@ -98,8 +98,8 @@ __all__ = [  # noqa: RUF022
     "__version__", "analysis", "bodies", "elements", "identification", "interop", "rotation", "scenes", "trigonometry",
     # systems
     "FirstOrderSystem", "LinearSystem", "System", "Elements", "Joints", "ConsistentInitial", "consistent_initial",
-    "JumpWarning", "PrecisionWarning", "Contact", "Event", "impact", "Sampled", "band_limited", "band_limited_motion", "sampled",
-    "sparse", "spline_gain_error",
+    "JumpWarning", "PrecisionWarning", "Contact", "Event", "impact", "Sampled", "band_limited", "band_limited_motion",
+    "sampled", "sparse", "spline_gain_error",
     # steppers
     "Info", "State", "Stepper", "banded", "conjugate_gradients", "sparse_lu",
     "bossak", "conventional_hht", "dop853", "dopri5", "extrapolated", "generalized_alpha", "hht", "houbolt",

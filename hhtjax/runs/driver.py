@@ -55,9 +55,9 @@ def drive(
     """
     flat, q, v, t0, params = problem.flat(caller)
     plain = loop = steps(flat._replace(factors=factors), problem.stepper, q, v, t0, params)
-    if events is not None:
+    if events is not None or flat.contact is not None:
         pieces = {"in_pieces": between, "with_modes": problem.output is not None}
-        loop = loop_with_events(plain, flat, problem.stepper, events, params, *room, **pieces)
+        loop = loop_with_events(plain, flat, problem.stepper, events or (), params, *room, **pieces)
     form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)  # without events, which are seldom
     (_, _, failure, *met), solution = sampling(Run(problem, flat, params, loop, form))
     run = solution(with_flaw(failure, flaw_at_start(problem.system, flat, loop.start, params)))

@@ -128,7 +128,7 @@ def meet(context: EventContext, now: tuple, found: Found, h: Array, params: PyTr
     rate = pick(this, d)
     missed = ~(jnp.abs(pick(this, g)) <= beside_zero(rate, h, pick(this, found.size)))
     missed = missed & ~(pick(this, found.jumped.astype(h.dtype)) > 0)
-    v, modes = events.outcome(i, e, now, events.with_modes(params, met.modes))
+    v, modes = events.outcome(i, e, now, events.with_modes(params, met.modes), h)
     row = row_of(e.t, i, rate, e.q, e.v, v)
 
     over = events.passed(i, met.over)
@@ -171,6 +171,7 @@ def behind(
     due = jnp.where(going_on, part.due, near_and_due) & ~(this > 0)
     same = (jnp.abs(d1 - d) <= nearness(h) * jnp.abs(d)) & (jnp.abs(g1 - g) <= nearness(h) * h * jnp.abs(d))
     same = same | jnp.asarray(events.timed)  # nothing changes those
+    same = same | events.closed(start)  # by the same impact
     corner = jnp.any(beside & ~(this > 0) & ~same)  # in another order they might have other outcomes
     code = jnp.where(corner, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
     if context.flat.num_constraints:

@@ -4,9 +4,9 @@ The residual holds the contact forces f0 of the start of the step; what they cha
 
     w1 = wf + G df,    G = A^-1 J^T,    y1 = yf + h gamma' K df,    K = J G,
 
-f standing for the free step, with f0, and gamma' = gamma (1 - alpha_f)/(1 - alpha_m). The modes that contacts have at the
-start give df (contact_modes.py). Where that lets a contact pull, hold more than friction allows, or slide backwards,
-the step is gone through from switch to switch. Behind it q, v, w and a go along G to where the modes have them: gaps
+f standing for the free step, with f0, and gamma' = gamma (1 - alpha_f)/(1 - alpha_m). The modes that contacts have at
+the start give df (contact_modes.py). Where that lets a contact pull, hold more than friction allows, or slide
+backwards, the step is gone through from switch to switch. Behind it q, v, w and a go along G to where the modes have them: gaps
 to 0, rates of what is held to 0, and accelerations onto the branch of the end, so that no jump enters the recursion.
 """
 
@@ -19,6 +19,7 @@ import jax.numpy as jnp
 
 from hhtjax.description import Array, PyTree
 from hhtjax.numerics.batched_cond import call_where
+from hhtjax.numerics.coulomb import SmallInverse, inverted
 from hhtjax.numerics.dense_lu import matvec
 from hhtjax.steppers.constrained import report_constraints
 from hhtjax.steppers.contact_modes import (
@@ -26,8 +27,6 @@ from hhtjax.steppers.contact_modes import (
     Course,
     Modes,
     Moment,
-    SmallInverse,
-    inverted,
     matrix,
     right_side,
     settled,
@@ -80,8 +79,8 @@ def _touching(system: FlatSystem, at: tuple, J: Array, w: Array, h: Array) -> Mo
 
 
 class End(NamedTuple):
-    """How contacts come out of a step: the modes, the integral of the rates over theta, the forces; by how much those in
-    the residual change, which rates are corrected by what, by what held ones are, and the code."""
+    """How contacts come out of a step: the modes, the integral of the rates over theta, the forces; by how much those
+    in the residual change, which rates are corrected by what, by what held ones are, and the code."""
 
     modes: Modes
     moved: Array

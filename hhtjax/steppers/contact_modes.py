@@ -12,7 +12,6 @@ complementarity problem: what one does may move the others.
 
 from __future__ import annotations
 
-from functools import reduce
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -21,11 +20,10 @@ from jax import lax
 
 from hhtjax.description import Array
 from hhtjax.numerics.batched_cond import call_where
-from hhtjax.numerics.complementarity import complement
-from hhtjax.numerics.dense_lu import diagonal, differentiable_inverse, matvec
+from hhtjax.numerics.coulomb import choice, inverted
+from hhtjax.numerics.dense_lu import matvec
 
 SWITCHES = 4, 2  # in a step, and for each contact
-PROXIMAL = 1e-9  # of a row, added to its diagonal: contacts may depend on each other
 FINE, NO_FORCES, MANY, JAMMED = 0.0, 1.0, 2.0, 3.0  # codes of a step
 
 
@@ -45,25 +43,6 @@ class Modes(NamedTuple):
         """(2 m,): which rates are 0."""
         closed, stuck, _ = self.which(mu)
         return jnp.concatenate([closed, stuck])
-
-
-class SmallInverse(NamedTuple):
-    """b -> S^-1 b of a small matrix whose rows may depend on each other, for b that allow it."""
-
-    S: Array
-    near: Array  # the inverse of S, a little regularised
-
-    def __call__(self, b: Array) -> Array:
-        x = matvec(self.near, b)
-        return x if len(b) == 2 else x + matvec(self.near, b - matvec(self.S, x))
-
-
-def inverted(S: Array) -> SmallInverse:
-    """The `SmallInverse`; of one contact without regularisation."""
-    if len(S) == 2:
-        return SmallInverse(S, differentiable_inverse(S))
-    largest = reduce(jnp.maximum, jnp.abs(S).T)
-    return SmallInverse(S, differentiable_inverse(S + jnp.diag(PROXIMAL * largest)))
 
 
 def matrix(A: Array, modes: Modes, mu: Array) -> Array:
@@ -87,33 +66,10 @@ def right_side(y: Array, f: Array, modes: Modes, mu: Array) -> Array:
 def settled(K: Array, y: Array, modes: Modes, mu: Array):
     """The modes behind an instant, of contacts that are closed, and stick or slide as `modes` say, there: who lets go,
     and who begins to slide; and the code. y: dy/dt without forces, K: what a unit of force adds to it."""
-    K, y, modes, mu = lax.stop_gradient((K, y, modes, mu))
-    m = len(mu)
-    closed, stuck, slides = modes.which(mu)
-    unit = 1 / jnp.sqrt(jnp.where(diagonal(K) > 0, diagonal(K), 1))
-    K, y = K * unit[:, None] * unit, y * unit
-    largest = jnp.max(jnp.abs(y))
-    y, mu = y / jnp.where(largest > 0, largest, 1), mu * unit[:m] / unit[m:]
-    of_N, of_T = K[:, :m] - jnp.where(slides, modes.sig * mu, 0) * K[:, m:], K[:, m:]
-    one, none = jnp.eye(m, dtype=K.dtype), jnp.zeros((m, m), K.dtype)
-    rows = [  # of f_N, of the parts of f_T in both directions, and of |ds/dt| where a contact slides off
-        [of_N[:m], of_T[:m], -of_T[:m], none],
-        [of_N[m:], of_T[m:], -of_T[m:], one],
-        [-of_N[m:], -of_T[m:], of_T[m:], one],
-        [mu * one, -one, -one, none],
-    ]
-    M = jnp.concatenate([jnp.concatenate(row, axis=1) for row in rows])
-    here = jnp.concatenate([closed, stuck, stuck, stuck])
-    M = jnp.where(here[:, None] & here, M, jnp.eye(4 * m, dtype=K.dtype))
-    found = complement(M, jnp.where(here, jnp.concatenate([y, -y[m:], 0 * mu]), 1))
-    f_N, one_way, other, _ = found.z.reshape(4, m)
-    f = jnp.concatenate([f_N, jnp.where(slides, -modes.sig * mu * f_N, one_way - other)])
-    slips = stuck & found.basic[3 * m :]
-    sig = jnp.where(slides, modes.sig, jnp.where(slips, jnp.sign((y + matvec(K, f))[m:]), 0))
-    now = closed & found.basic[:m]
-    jammed = jnp.any(slides & (diagonal(of_N[:m]) <= PROXIMAL))
-    code = jnp.where(jammed, JAMMED, jnp.where(found.found, FINE, NO_FORCES)).astype(y.dtype)
-    return Modes(now.astype(y.dtype), jnp.where(now, sig, 0)), code
+    closed, _, slides = modes.which(mu)
+    found = choice(K, y, mu, jnp.zeros_like(mu), closed, jnp.where(slides, modes.sig, 0))
+    code = jnp.where(found.jams, JAMMED, jnp.where(found.found, FINE, NO_FORCES)).astype(y.dtype)
+    return Modes(found.pushes.astype(y.dtype), jnp.where(found.pushes, found.sig, 0)), code
 
 
 class Course(NamedTuple):

@@ -258,7 +258,8 @@ class Stepper(Description):
         w = ravel_pytree((state.w if flat.positions else state.v, state.zdot))[0]
         a = None if state.a is None else ravel_pytree((state.a, state.za))[0]
         step = bound(self.astype(q.dtype), flat, params, jnp.asarray(dt).astype(q.dtype))
-        state, info = step(State(state.t, q, v, w, a, state.L, state.memory, friction=state.friction, contact=state.contact))
+        rest = {"L": state.L, "memory": state.memory, "friction": state.friction, "contact": state.contact}
+        state, info = step(State(state.t, q, v, w, a, **rest))
         return _unravel(flat, state), info
 
 

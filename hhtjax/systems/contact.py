@@ -68,7 +68,8 @@ class Contact(Description):
         _require_coefficient("restitution", self.restitution, lambda e: (e >= 0) & (e <= 1), "lie in [0, 1]")
         if self.sliding is None and not (isinstance(self.friction, (int, float)) and self.friction == 0):
             raise ValueError(
-                f"Contact: `friction` needs `sliding`, the velocity along the surface; received friction={self.friction!r}."
+                "Contact: `friction` needs `sliding`, the velocity along the surface; received "
+                f"friction={self.friction!r} alone."
             )
 
 

@@ -17,8 +17,8 @@ from hhtjax.description import Array, Description, PyTree, Real
 from hhtjax.jaxpr import linear_map
 from hhtjax.primitives import traced
 from hhtjax.systems.assembly import put_together
-from hhtjax.systems.elements import Elements, Joints
 from hhtjax.systems.contact import Contact
+from hhtjax.systems.elements import Elements, Joints
 from hhtjax.systems.friction import require_friction
 from hhtjax.systems.linear_system import LinearSystem
 from hhtjax.systems.matrices import constant_matrix, require_mass

@@ -1,0 +1,102 @@
+"""Coulomb's law of a few contacts in a plane as a linear complementarity problem, for forces and for impulses.
+
+    y + K f,   f_N >= 0,   (y + K f)_N >= 0,   of each contact one is 0
+    |f_T| <= mu (f_N + off),   opposite to (y + K f)_T where that is not 0
+
+f_T is the difference of two parts >= 0, and what slides has a speed >= 0 of its own: 4 m rows, copositive, for which
+Lemke's method finds a solution (Stewart, Trinkle 1996). Rows may depend on each other; then forces are one of many.
+"""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from hhtjax.description import Array
+from hhtjax.numerics.complementarity import complement
+from hhtjax.numerics.dense_lu import diagonal, differentiable_inverse, matvec
+
+PROXIMAL = 1e-9  # of a row, added to its diagonal: contacts may depend on each other
+
+
+class SmallInverse(NamedTuple):
+    """b -> S^-1 b of a small matrix whose rows may depend on each other, for b that allow it."""
+
+    S: Array
+    near: Array  # the inverse of S, a little regularised
+
+    def __call__(self, b: Array) -> Array:
+        x = matvec(self.near, b)
+        return x if len(b) == 2 else x + matvec(self.near, b - matvec(self.S, x))
+
+
+def inverted(S: Array) -> SmallInverse:
+    """The `SmallInverse`; of one contact without regularisation."""
+    if len(S) == 2:
+        return SmallInverse(S, differentiable_inverse(S))
+    largest = reduce(jnp.maximum, jnp.abs(S).T)
+    return SmallInverse(S, differentiable_inverse(S + jnp.diag(PROXIMAL * largest)))
+
+
+class Choice(NamedTuple):
+    """pushes: (m,), whether (y + K f)_N = 0; sticks: whether (y + K f)_T = 0; sig: else, in which direction that is;
+    found: whether there are such forces; jams: whether normal force of a contact that slides presses it together."""
+
+    pushes: Array
+    sticks: Array
+    sig: Array
+    found: Array
+    jams: Array
+
+
+def choice(K: Array, y: Array, mu: Array, off: Array, here: Array, sliding: Array) -> Choice:
+    """Which of the contacts `here` push and stick. sliding: -1 or 1 where f_T = -sliding mu f_N is known, else 0."""
+    K, y, mu, off = lax.stop_gradient((K, y, mu, off))
+    m, rests = len(mu), here & (sliding == 0) & (mu > 0)
+    unit = 1 / jnp.sqrt(jnp.where(diagonal(K) > 0, diagonal(K), 1))
+    K, y = K * unit[:, None] * unit, y * unit
+    largest = jnp.max(jnp.abs(y))
+    largest = jnp.where(largest > 0, largest, 1)
+    y, mu, off = y / largest, mu * unit[:m] / unit[m:], off / (unit[:m] * largest)
+    of_N, of_T = K[:, :m] - sliding * mu * K[:, m:], K[:, m:]
+    one, none = jnp.eye(m, dtype=K.dtype), jnp.zeros((m, m), K.dtype)
+    rows = [  # of f_N, of both parts of f_T, and of the speed of what slides off
+        [of_N[:m], of_T[:m], -of_T[:m], none],
+        [of_N[m:], of_T[m:], -of_T[m:], one],
+        [-of_N[m:], -of_T[m:], of_T[m:], one],
+        [mu * one, -one, -one, none],
+    ]
+    M = jnp.concatenate([jnp.concatenate(row, axis=1) for row in rows])
+    some = jnp.concatenate([here, rests, rests, rests])
+    M = jnp.where(some[:, None] & some, M, jnp.eye(4 * m, dtype=K.dtype))
+    found = complement(M, jnp.where(some, jnp.concatenate([y, -y[m:], mu * off]), 1))
+    f_N, one_way, other, _ = found.z.reshape(4, m)
+    along = (y + matvec(K, jnp.concatenate([f_N, jnp.where(rests, one_way - other, -sliding * mu * f_N)])))[m:]
+    slips = found.basic[3 * m :]
+    jams = jnp.any(here & (sliding != 0) & (diagonal(of_N[:m]) <= PROXIMAL))
+    sig = jnp.where(rests, jnp.where(slips, jnp.sign(along), 0), sliding)
+    return Choice(here & found.basic[:m], rests & ~slips, sig, found.found, jams)
+
+
+def impulses(K: Array, y: Array, mu: Array, e: Array, here: Array) -> Array:
+    """(2 m,): those of an impact of the contacts `here`, by Poisson's law, e (m,) being the restitution."""
+    m = len(mu)
+    C = _phase(K, y, mu, jnp.zeros_like(e), here)
+    back = jnp.concatenate([e * C[:m], jnp.zeros_like(e)])
+    return C + back + _phase(K, y + matvec(K, C + back), mu, back[:m], here)
+
+
+def _phase(K: Array, y: Array, mu: Array, off: Array, here: Array) -> Array:
+    """f of the law above."""
+    m = len(mu)
+    chosen = choice(K, y, mu, off, here, jnp.zeros_like(mu))
+    one = jnp.eye(2 * m, dtype=K.dtype)
+    along = one[m:] + (chosen.sig * mu)[:, None] * one[:m]
+    S = jnp.concatenate(
+        [jnp.where(chosen.pushes[:, None], K[:m], one[:m]), jnp.where(chosen.sticks[:, None], K[m:], along)]
+    )
+    b = jnp.concatenate([jnp.where(chosen.pushes, -y[:m], 0), jnp.where(chosen.sticks, -y[m:], -chosen.sig * mu * off)])
+    return inverted(S)(b)

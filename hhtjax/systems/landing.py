@@ -1,0 +1,60 @@
+"""Impacts of contacts: what the velocities become where bodies meet that were apart.
+
+    compression: C >= 0 with (y + K C)_N >= 0, of each contact one is 0, and Coulomb's law for (y + K C)_T
+    expansion:   E, the same from y + K C on, with E_N >= e C_N
+    v+ = v + M^-1 J^T (C + E)
+
+Poisson's law of restitution, in each phase with friction. It makes no energy; Newton's, with friction, can.
+
+References: F. Pfeiffer, C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996, Sec. 8; D. Stewart, J. Trinkle,
+Int. J. Numer. Methods Eng. 39, 1996, 2673-2691 (the complementarity problem).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+
+from hhtjax.description import Array, PyTree
+from hhtjax.numerics.coulomb import impulses
+from hhtjax.systems.constraints import answers
+from hhtjax.systems.contact import directions, rates, rates_of_rates
+from hhtjax.systems.friction import across
+
+if TYPE_CHECKING:
+    from hhtjax.steppers.stepper import State
+    from hhtjax.systems.flat_system import FlatSystem
+
+FAR = 1.0  # m, or what the gap is in: of a contact that is closed, whose gap is a rounding of 0 and no guard
+NEAR = 1e-6  # part of what moves in a step, within which a contact takes part in an impact
+SHORT = 1.0  # steps: a flight that is shorter does not begin
+
+
+def guards(system: FlatSystem, s: State, params: PyTree) -> Array:
+    """(m,): the gaps of contacts that are open."""
+    return jnp.where(s.contact.closed > 0, FAR, system.contact.gap(s.q, s.t, params))
+
+
+def landed(system: FlatSystem, s: State, params: PyTree, h: Array, redundant=None) -> Array:
+    """The velocities (N,) behind an impact at a state s in which a gap has closed; h: the step, by which flights that
+    are too short for it are known."""
+    contact, m = system.contact, system.contact.size
+    q, v, t = s.q, s.v, s.t
+    answer = answers(system, q, t, params, redundant)
+    J, y = directions(system, q, t, params), rates(system, q, v, t, params)
+    G = jnp.stack([answer(row)[0] for row in J])
+    fast = matvec_abs(J, v) + h * matvec_abs(J, s.w)
+    closed = s.contact.closed > 0
+    here = closed | (contact.gap(q, t, params) <= NEAR * h * fast[:m])
+    hits = here & ~closed & (y[:m] < 0)
+    e = jnp.where(jnp.any(closed & here), 0, contact.restitution(params))
+    falling = -rates_of_rates(system, q, v, s.w, t, params)[:m]
+    short = hits & (2 * e * -y[:m] <= SHORT * h * falling)
+    e = jnp.where(hits & ~short, e, 0)
+    return v + jnp.sum(impulses(across(J, G), y, contact.friction(params), e, here)[:, None] * G, axis=0)
+
+
+def matvec_abs(J: Array, x: Array) -> Array:
+    """|J| |x|."""
+    return jnp.sum(jnp.abs(J) * jnp.abs(x), axis=1)
