@@ -79,7 +79,7 @@ def complement(M: Array, q: Array) -> Complement:
     return Complement(jnp.maximum(z, 0), basic, done | (left <= _small(q.dtype)))
 
 
-def _pivot(tableau: Array, basis: Array, row: Array, column: Array):
+def _pivot(tableau: Array, basis: Array, row: Array, column: Array | int):
     """The tableau and the basis with the variable of a column in that of a row."""
     here = jnp.arange(len(basis)) == row
     own = tableau[row] / tableau[row, column]

@@ -299,7 +299,7 @@ class Solution(NamedTuple):
                 "matrices M, C and K are too far apart in size for this step, or for float32"
             )
         if contact:
-            return CONTACT[float(contact)]
+            return CONTACT[int(contact)]
         if np.isinf(friction):
             return "a limit of the dry friction is negative or not finite: see `friction` of the System"
         if friction == DEPENDENT:

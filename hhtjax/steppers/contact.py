@@ -6,8 +6,9 @@ The residual holds the contact forces f0 of the start of the step; what they cha
 
 f standing for the free step, with f0, and gamma' = gamma (1 - alpha_f)/(1 - alpha_m). The modes that contacts have at
 the start give df (contact_modes.py). Where that lets a contact pull, hold more than friction allows, or slide
-backwards, the step is gone through from switch to switch. Behind it q, v, w and a go along G to where the modes have them: gaps
-to 0, rates of what is held to 0, and accelerations onto the branch of the end, so that no jump enters the recursion.
+backwards, the step is gone through from switch to switch. Behind it q, v, w and a go along G to where the modes have
+them: gaps to 0, rates of what is held to 0, and accelerations onto the branch of the end, so that no jump enters the
+recursion.
 """
 
 from __future__ import annotations

@@ -211,7 +211,7 @@ def free_step(
     z: Array,
     s: State,
     factorize: Callable | Updated,
-    at: State,
+    at: State | None,
 ):
     """The step in which every joint keeps its friction, and those that stuck have none; its factors are kept."""
     if options.iterations is None:

@@ -73,7 +73,7 @@ class Contact(Description):
             )
 
 
-def _require_coefficient(name: str, value, valid: Callable, expectation: str):
+def _require_coefficient(name: str, value: Any, valid: Callable, expectation: str):
     """An error for what is no number, array, name or function of params."""
     if callable(value) and not is_array(value):
         require_function("Contact", name, value, f"{name}(params)")
@@ -117,7 +117,8 @@ def flat_contact(
     friction, restitution = (
         partial(_coefficient, caller, name, getattr(contact, name), m, dtype) for name in ("friction", "restitution")
     )
-    friction(params), restitution(params)  # their errors, at once
+    for coefficient in (friction, restitution):  # their errors, at once
+        coefficient(params)
     return FlatContact(consistent(gap), consistent(sliding), friction, restitution, m, contact.sliding is not None)
 
 
@@ -133,7 +134,7 @@ def _rows(caller: str, name: str, function: Callable, dtype: Any, *args: PyTree)
 
 def _coefficient(caller: str, name: str, given: Any, m: int, dtype: Any, params: PyTree) -> Array:
     """(m,), from params."""
-    params = thaw(params)
+    params, value = thaw(params), None
     if isinstance(given, str):
         if not isinstance(params, dict) or given not in params:
             raise ValueError(
@@ -141,7 +142,7 @@ def _coefficient(caller: str, name: str, given: Any, m: int, dtype: Any, params:
             )
         value = params[given]
     else:
-        value = given(params) if callable(given) and not is_array(given) else given
+        value: Any = given(params) if callable(given) and not is_array(given) else given
     if jnp.shape(value) not in ((), (m,)):
         raise ValueError(f"{caller}: `{name}` must be a number or have shape ({m},); received {describe(value)}.")
     return jnp.broadcast_to(jnp.asarray(value).astype(dtype), (m,))

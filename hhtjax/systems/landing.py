@@ -12,7 +12,7 @@ Int. J. Numer. Methods Eng. 39, 1996, 2673-2691 (the complementarity problem).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 
@@ -23,7 +23,6 @@ from hhtjax.systems.contact import directions, rates, rates_of_rates
 from hhtjax.systems.friction import across
 
 if TYPE_CHECKING:
-    from hhtjax.steppers.stepper import State
     from hhtjax.systems.flat_system import FlatSystem
 
 FAR = 1.0  # m, or what the gap is in: of a contact that is closed, whose gap is a rounding of 0 and no guard
@@ -31,15 +30,18 @@ NEAR = 1e-6  # part of what moves in a step, within which a contact takes part i
 SHORT = 1.0  # steps: a flight that is shorter does not begin
 
 
-def guards(system: FlatSystem, s: State, params: PyTree) -> Array:
+def guards(system: FlatSystem, s: Any, params: PyTree) -> Array:
     """(m,): the gaps of contacts that are open."""
+    assert system.contact is not None
     return jnp.where(s.contact.closed > 0, FAR, system.contact.gap(s.q, s.t, params))
 
 
-def landed(system: FlatSystem, s: State, params: PyTree, h: Array, redundant=None) -> Array:
+def landed(system: FlatSystem, s: Any, params: PyTree, h: Array, redundant=None) -> Array:
     """The velocities (N,) behind an impact at a state s in which a gap has closed; h: the step, by which flights that
     are too short for it are known."""
-    contact, m = system.contact, system.contact.size
+    contact = system.contact
+    assert contact is not None
+    m = contact.size
     q, v, t = s.q, s.v, s.t
     answer = answers(system, q, t, params, redundant)
     J, y = directions(system, q, t, params), rates(system, q, v, t, params)
