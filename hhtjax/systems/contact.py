@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.checks import count, describe, require_function, require_number
 from hhtjax.description import Array, Description, PyTree, Real, is_array, thaw
@@ -75,12 +76,14 @@ class Contact(Description):
 
 def _require_coefficient(name: str, value: Any, valid: Callable, expectation: str):
     """An error for what is no number, array, name or function of params."""
-    if callable(value) and not is_array(value):
-        require_function("Contact", name, value, f"{name}(params)")
-    elif is_array(value) and jnp.ndim(value) == 1:
+    if isinstance(value, str):
+        return
+    if is_array(value) and np.ndim(value) == 1:
         for x in value:
             require_number("Contact", name, x, valid, expectation)
-    elif not isinstance(value, str):
+    elif callable(value) and not is_array(value):
+        require_function("Contact", name, value, f"{name}(params)")
+    else:
         require_number("Contact", name, value, valid, expectation)
 
 
