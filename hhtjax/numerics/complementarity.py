@@ -82,7 +82,7 @@ def complement(M: Array, q: Array) -> Complement:
 def _pivot(tableau: Array, basis: Array, row: Array, column: Array | int):
     """The tableau and the basis with the variable of a column in that of a row."""
     here = jnp.arange(len(basis)) == row
-    own = tableau[row] / tableau[row, column]
+    own = (tableau[row] / tableau[row, column])[None, :]
     tableau = jnp.where(here[:, None], own, tableau - tableau[:, column][:, None] * own)
     return tableau, jnp.where(here, column, basis)
 

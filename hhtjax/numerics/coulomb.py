@@ -42,12 +42,14 @@ def inverted(S: Array) -> SmallInverse:
 
 
 class Choice(NamedTuple):
-    """pushes: (m,), whether (y + K f)_N = 0; sticks: whether (y + K f)_T = 0; sig: else, in which direction that is;
-    found: whether there are such forces; jams: whether normal force of a contact that slides presses it together."""
+    """pushes: (m,), whether f_N makes (y + K f)_N = 0; sticks: whether f_T makes (y + K f)_T = 0; sig: in which direction
+    that is, 0 where it is 0; f: such forces; found: whether there are any; jams: whether normal force of a contact that
+    slides presses it together. All is constant to derivatives."""
 
     pushes: Array
     sticks: Array
     sig: Array
+    f: Array
     found: Array
     jams: Array
 
@@ -57,28 +59,32 @@ def choice(K: Array, y: Array, mu: Array, off: Array, here: Array, sliding: Arra
     K, y, mu, off = lax.stop_gradient((K, y, mu, off))
     m, rests = len(mu), here & (sliding == 0) & (mu > 0)
     unit = 1 / jnp.sqrt(jnp.where(diagonal(K) > 0, diagonal(K), 1))
-    K, y = K * unit[:, None] * unit, y * unit
+    K, y = K * unit[:, None] * unit[None, :], y * unit
     largest = jnp.max(jnp.abs(y))
     largest = jnp.where(largest > 0, largest, 1)
     y, mu, off = y / largest, mu * unit[:m] / unit[m:], off / (unit[:m] * largest)
-    of_N, of_T = K[:, :m] - sliding * mu * K[:, m:], K[:, m:]
+    of_N, of_T = K[:, :m] - (sliding * mu)[None, :] * K[:, m:], K[:, m:]
     one, none = jnp.eye(m, dtype=K.dtype), jnp.zeros((m, m), K.dtype)
     rows = [  # of f_N, of both parts of f_T, and of the speed of what slides off
         [of_N[:m], of_T[:m], -of_T[:m], none],
         [of_N[m:], of_T[m:], -of_T[m:], one],
         [-of_N[m:], -of_T[m:], of_T[m:], one],
-        [mu * one, -one, -one, none],
+        [mu[None, :] * one, -one, -one, none],
     ]
     M = jnp.concatenate([jnp.concatenate(row, axis=1) for row in rows])
     some = jnp.concatenate([here, rests, rests, rests])
-    M = jnp.where(some[:, None] & some, M, jnp.eye(4 * m, dtype=K.dtype))
+    M = jnp.where(some[:, None] & some[None, :], M, jnp.eye(4 * m, dtype=K.dtype))
     found = complement(M, jnp.where(some, jnp.concatenate([y, -y[m:], mu * off]), 1))
     f_N, one_way, other, _ = found.z.reshape(4, m)
-    along = (y + matvec(K, jnp.concatenate([f_N, jnp.where(rests, one_way - other, -sliding * mu * f_N)])))[m:]
-    slips = found.basic[3 * m :]
+    f = jnp.concatenate([f_N, jnp.where(rests, one_way - other, -sliding * mu * f_N)])
+    along = (y + matvec(K, f))[m:]
+    pushes, one_way, other, slips = found.basic.reshape(4, m)
     jams = jnp.any(here & (sliding != 0) & (diagonal(of_N[:m]) <= PROXIMAL))
-    sig = jnp.where(rests, jnp.where(slips, jnp.sign(along), 0), sliding)
-    return Choice(here & found.basic[:m], rests & ~slips, sig, found.found, jams)
+    sticks = jnp.where(slips, one_way & other, one_way | other)
+    # what slides off with no speed yet does so against its force
+    direction = jnp.where(one_way, -1, jnp.where(other, 1, jnp.sign(along)))
+    sig = jnp.where(rests, jnp.where(slips & ~sticks, direction, 0), sliding).astype(y.dtype)
+    return Choice(here & pushes, rests & sticks, sig, f * unit * largest, found.found, jams)
 
 
 def impulses(K: Array, y: Array, mu: Array, e: Array, here: Array) -> Array:
@@ -99,4 +105,4 @@ def _phase(K: Array, y: Array, mu: Array, off: Array, here: Array) -> Array:
         [jnp.where(chosen.pushes[:, None], K[:m], one[:m]), jnp.where(chosen.sticks[:, None], K[m:], along)]
     )
     b = jnp.concatenate([jnp.where(chosen.pushes, -y[:m], 0), jnp.where(chosen.sticks, -y[m:], -chosen.sig * mu * off)])
-    return inverted(S)(b)
+    return chosen.f + inverted(S)(b - matvec(S, chosen.f))

@@ -152,7 +152,7 @@ def _end(s: ContactState, K: Array, y0: Array, yf: Array, mu: Array, lag: Array,
         begin = Moment(jnp.zeros_like(h), y0, steady.modes, jnp.zeros_like(y0), f0, jnp.zeros_like(h))
         at = to_the_end(begin, Course(y1 - y0, f0, steady.df, h * K, mu))
         there = jnp.concatenate([closed, closed & (mu > 0)])
-        block = inverted(jnp.where(there[:, None] & there, K, jnp.eye(2 * m, dtype=K.dtype)))
+        block = inverted(jnp.where(there[:, None] & there[None, :], K, jnp.eye(2 * m, dtype=K.dtype)))
         df = block(jnp.where(there, (at.y - yf) / lag, 0))
         return End(at.modes, at.moved, at.f, df, there, block, inverted(matrix(K, at.modes, mu)), at.code)
 
