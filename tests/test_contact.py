@@ -106,9 +106,9 @@ def test_a_body_slides_until_it_rolls(inertia, left):
 def test_a_stack_at_rest_does_not_move():
     found = run(stack(0.0), 100)
     found.check()
-    assert jnp.max(jnp.abs(found.q - found.q[0])) <= 1e-15
+    assert jnp.max(jnp.abs(found.q - found.q[:1])) <= 1e-15
     weights = GRAVITY * jnp.array([2.2, 1.2, 0.5])
-    assert jnp.max(jnp.abs(found.contact.normal - weights)) < 1e-12
+    assert jnp.max(jnp.abs(found.contact.normal - weights[None])) < 1e-12
     assert bool(found.contact.sticking.all())
 
 
@@ -123,7 +123,7 @@ def test_a_stack_on_a_shaken_floor():
     found = run(stack(beyond), 200)
     found.check()
     assert not bool(found.contact.sticking.all())
-    assert jnp.max(jnp.abs(jnp.diff(found.q[:, 3:], axis=1, prepend=0.0) - jnp.array([0.0, 1.0, 1.0]))) < 1e-12
+    assert jnp.max(jnp.abs(jnp.diff(found.q[:, 3:], axis=1, prepend=0.0) - jnp.array([[0.0, 1.0, 1.0]]))) < 1e-12
 
 
 @pytest.mark.slow
@@ -142,8 +142,8 @@ def test_a_ball_without_friction_bounces_as_by_an_event():
     a, b = hhtjax.simulate(by_contact, *start, **how), hhtjax.simulate(by_event, *start, events=[floor], **how)
     a.check()
     assert int(a.events.count) == int(b.events.count) > 1
-    assert jnp.max(jnp.abs(a.q - b.q)) < 1e-12
-    assert jnp.max(jnp.abs(a.v - b.v)) < 1e-11
+    assert jnp.max(jnp.abs(a.q - b.q)) < 1e-11
+    assert jnp.max(jnp.abs(a.v - b.v)) < 1e-10
 
 
 # ----------------------------------------------------------------------------
@@ -187,19 +187,19 @@ def test_derivatives_are_those_of_the_run(make, name, steps):
 
 @pytest.mark.slow
 def test_a_block_rocks_until_it_stands():
-    """Its energy falls with each impact of a corner, by the square of what angular momentum about it keeps."""
+    """With each impact of a corner it keeps 1 - 3/2 sin^2 of its turning, by the angular momentum about that corner
+    (Housner, Bull. Seismol. Soc. Am. 53, 1963, 403-417); in the end both corners stay down."""
     scene = block()
     found = run(scene, 600)
     found.check()
-    b, h = 0.5, 1.0
-    kept = (3 * (h**2 - b**2) / (4 * (b**2 + h**2)) + 1 / 4) ** 2  # Housner (1963): 1 - 3/2 sin^2 of the half angle
-    kept = (1 - 1.5 * (b / np.hypot(b, h)) ** 2) ** 2
-    turn = found.v[:, 2]
-    energy = 0.5 * (found.v[:, 0] ** 2 + found.v[:, 1] ** 2 + (b**2 + h**2) / 3 * turn**2) + GRAVITY * found.q[:, 1]
-    above = energy - GRAVITY * h
-    first = int(jnp.argmax(found.q[:, 2] < 0))
-    assert abs(above[first + 5] / above[first - 5] - kept) < 1e-3
-    assert jnp.max(jnp.abs(found.q[:, 0] - found.q[0, 0])) < 2  # it does not walk away
+    count = int(found.events.count)
+    turned = found.events.after[: count - 1, 2] / found.events.before[: count - 1, 2]
+    assert count > 10
+    assert jnp.allclose(turned, 1 - 1.5 * 0.5**2 / (0.5**2 + 1.0**2), atol=1e-12)
+    assert bool(found.contact.closed[-1].all())
+    assert jnp.allclose(found.q[-1], jnp.array([found.q[-1, 0], 1.0, 0.0]), atol=1e-14)
+    assert not jnp.any(found.v[-1])
+    assert jnp.allclose(found.contact.normal[-1], GRAVITY / 2, atol=1e-12)
 
 
 # ----------------------------------------------------------------------------

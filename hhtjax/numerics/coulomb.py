@@ -42,8 +42,8 @@ def inverted(S: Array) -> SmallInverse:
 
 
 class Choice(NamedTuple):
-    """pushes: (m,), whether f_N makes (y + K f)_N = 0; sticks: whether f_T makes (y + K f)_T = 0; sig: in which direction
-    that is, 0 where it is 0; f: such forces; found: whether there are any; jams: whether normal force of a contact that
+    """pushes: (m,), whether f_N makes (y + K f)_N = 0; sticks: whether f_T makes (y + K f)_T = 0; sig: the direction of
+    that, 0 where it is 0; f: such forces; found: whether there are any; jams: whether normal force of a contact that
     slides presses it together. All is constant to derivatives."""
 
     pushes: Array

@@ -25,6 +25,7 @@ from hhtjax.numerics.dense_lu import matvec
 from hhtjax.steppers.constrained import report_constraints
 from hhtjax.steppers.contact_modes import (
     FINE,
+    ROUNDING,
     Course,
     Modes,
     Moment,
@@ -36,15 +37,15 @@ from hhtjax.steppers.contact_modes import (
 from hhtjax.steppers.friction import each_row, equations_of, free_step
 from hhtjax.steppers.stepper import ContactState
 from hhtjax.systems.constraints import answers, curvature
-from hhtjax.systems.contact import directions, rates, rates_of_rates, reaction
+from hhtjax.systems.contact import directions, rates, rates_of_rates, reaction, speeds
 from hhtjax.systems.friction import across
 
 if TYPE_CHECKING:
     from hhtjax.steppers.stepper import State
     from hhtjax.systems.flat_system import FlatSystem
 
-ROUNDING = 64  # of the largest force, that a force may be beyond what its mode allows
-CLOSED = 1e-9  # part of what moves in a step, within which a gap, or its rate, is 0
+CLOSED = 1e-9  # part of what moves in a step, within which the rate of a gap is 0
+TOUCHING = 1e-6  # the same of a gap: an event that is located to rounding of the time
 CORRECTIONS = 2  # of the gap
 PENETRATES = 4.0  # the code of a step, as those of contact_modes.py
 
@@ -72,10 +73,10 @@ def _touching(system: FlatSystem, at: tuple, J: Array, w: Array, h: Array) -> Mo
     """Contacts that are closed, but for those that the accelerations take apart, and who of them slides."""
     q, v, t, params = at
     m, gap, y = system.contact.size, system.contact.gap(q, t, params), rates(system, *at)
-    fast = matvec(jnp.abs(J), jnp.abs(v)) + h * matvec(jnp.abs(J), jnp.abs(w))
+    fast = speeds(J, v, w, h)
     small = max(CLOSED, 1e3 * float(jnp.finfo(q.dtype).eps)) * fast
-    closed = (jnp.abs(gap) <= h * small[:m]) & (jnp.abs(y[:m]) <= small[:m])
-    slides = closed & (jnp.abs(y[m:]) > small[m:])
+    closed = (jnp.abs(gap) <= TOUCHING * h * fast) & (jnp.abs(y[:m]) <= small)
+    slides = closed & (jnp.abs(y[m:]) > small)
     return Modes(closed.astype(q.dtype), jnp.where(slides, jnp.sign(y[m:]), 0))
 
 

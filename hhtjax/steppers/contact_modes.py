@@ -24,6 +24,7 @@ from hhtjax.numerics.coulomb import choice, inverted
 from hhtjax.numerics.dense_lu import matvec
 
 SWITCHES = 4, 2  # in a step, and for each contact
+ROUNDING = 64  # of the largest force, that a force may be beyond what its mode allows
 FINE, NO_FORCES, MANY, JAMMED = 0.0, 1.0, 2.0, 3.0  # codes of a step
 
 
@@ -137,9 +138,11 @@ def _first_switch(theta: Array, y: Array, speed: Array, first: Array, last: Arra
     m = len(mu)
     closed, stuck, slides = modes.which(mu)
 
+    noise = ROUNDING * float(jnp.finfo(y.dtype).eps) * jnp.max(jnp.abs(first) + jnp.abs(last))
+
     def crossing(a: Array, b: Array, some: Array) -> Array:
-        """Where what goes from a to b falls below 0."""
-        falls = some & (b < 0) & (b < a)
+        """Where what goes from a to b falls below 0, by more than rounding in the end."""
+        falls = some & (b < -noise) & (b < a)
         there = a / jnp.where(falls, a - b, 1)
         return jnp.where(falls, jnp.where(there > theta, there, theta), jnp.inf)
 

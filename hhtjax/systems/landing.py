@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 
 from hhtjax.description import Array, PyTree
-from hhtjax.numerics.coulomb import impulses
-from hhtjax.systems.constraints import answers
-from hhtjax.systems.contact import directions, rates, rates_of_rates
+from hhtjax.numerics.coulomb import choice, impulses, inverted
+from hhtjax.numerics.dense_lu import matvec
+from hhtjax.systems.constraints import answers, curvature
+from hhtjax.systems.contact import directions, rates, rates_of_rates, speeds
 from hhtjax.systems.friction import across
 
 if TYPE_CHECKING:
@@ -46,17 +47,36 @@ def landed(system: FlatSystem, s: Any, params: PyTree, h: Array, redundant=None)
     answer = answers(system, q, t, params, redundant)
     J, y = directions(system, q, t, params), rates(system, q, v, t, params)
     G = jnp.stack([answer(row)[0] for row in J])
-    fast = matvec_abs(J, v) + h * matvec_abs(J, s.w)
+    fast = speeds(J, v, s.w, h)
     closed = s.contact.closed > 0
-    here = closed | (contact.gap(q, t, params) <= NEAR * h * fast[:m])
+    here = closed | (contact.gap(q, t, params) <= NEAR * h * fast)
     hits = here & ~closed & (y[:m] < 0)
     e = jnp.where(jnp.any(closed & here), 0, contact.restitution(params))
     falling = -rates_of_rates(system, q, v, s.w, t, params)[:m]
     short = hits & (2 * e * -y[:m] <= SHORT * h * falling)
     e = jnp.where(hits & ~short, e, 0)
-    return v + jnp.sum(impulses(across(J, G), y, contact.friction(params), e, here)[:, None] * G, axis=0)
+    K, mu, small = across(J, G), contact.friction(params), NEAR * fast
+    f = impulses(K, y, mu, e, here)
+    v = v + matvec(G.T, f)
+    if m == 1:
+        return v
+    w, _ = answer(
+        system.force(q, v, t, params), -curvature(system, q, v, t, params) if system.num_constraints else None
+    )
+    return v + matvec(
+        G.T, _settling(K, y + matvec(K, f), rates_of_rates(system, q, v, w, t, params), mu, here, small, h)
+    )
 
 
-def matvec_abs(J: Array, x: Array) -> Array:
-    """|J| |x|."""
-    return jnp.sum(jnp.abs(J) * jnp.abs(x), axis=1)
+def _settling(K: Array, y: Array, ydot: Array, mu: Array, here: Array, small: Array, h: Array) -> Array:
+    """The impulses (2 m,) that keep contacts down which an impact of another lets up, for a flight too short for the
+    step: as those of a block do that comes to rest on both its corners, in infinitely many impacts."""
+    m = len(mu)
+    rests = here & (y[:m] <= small)
+    slides = jnp.where(jnp.abs(y[m:]) > small, jnp.sign(y[m:]), 0)
+    falling = -(ydot + matvec(K, choice(K, ydot, mu, jnp.zeros_like(mu), rests, slides).f))[:m]
+    short = here & ~rests & (2 * y[:m] <= SHORT * h * falling)
+    down = (rests | short) & jnp.any(short)
+    held = jnp.concatenate([down, down & (slides == 0) & (mu > 0)])
+    S = jnp.where(held[:, None], K, jnp.eye(2 * m, dtype=K.dtype))
+    return inverted(S)(jnp.where(held, -y, 0))
