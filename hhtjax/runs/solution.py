@@ -119,8 +119,7 @@ CONTACT = {  # what went wrong with contacts, by the code of a step
     2: "contacts let go, stick and slide too often within the step. Take a smaller dt",
     3: "a contact jams: with so much friction, more normal force presses the bodies together (Painleve). Take less "
     "`friction`, or compliance in `force`",
-    4: "bodies touch that were apart, and go through each other: impacts are not solved yet. Take an `Event` with "
-    "terminal=True, and go on from there",
+    4: "bodies go through each other within the step, as where a contact lets go and returns. Take a smaller dt",
 }
 WAYS = {
     INDEFINITE: f". {MASSLESS}",
