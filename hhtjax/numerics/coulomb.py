@@ -90,9 +90,13 @@ def choice(K: Array, y: Array, mu: Array, off: Array, here: Array, sliding: Arra
 def impulses(K: Array, y: Array, mu: Array, e: Array, here: Array) -> Array:
     """(2 m,): those of an impact of the contacts `here`, by Poisson's law, e (m,) being the restitution."""
     m = len(mu)
-    C = _phase(K, y, mu, jnp.zeros_like(e), here)
-    back = jnp.concatenate([e * C[:m], jnp.zeros_like(e)])
-    return C + back + _phase(K, y + matvec(K, C + back), mu, back[:m], here)
+
+    def phase(now: tuple, _):
+        y, back = now  # in the second one at least e times the normal impulses of the first come back
+        f = _phase(K, y, mu, back, here) + jnp.concatenate([back, jnp.zeros_like(back)])
+        return (y + matvec(K, f) + matvec(K[:, :m], e * f[:m]), e * f[:m]), f
+
+    return jnp.sum(lax.scan(phase, (y, jnp.zeros_like(e)), length=2)[1], axis=0)
 
 
 def _phase(K: Array, y: Array, mu: Array, off: Array, here: Array) -> Array:

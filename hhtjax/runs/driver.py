@@ -35,9 +35,6 @@ if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
 
-ROOM = 2, 100  # where a run takes no events: impacts of contacts in a step, and how many are told
-
-
 def drive(
     problem: Problem,
     steps: Callable,
@@ -58,13 +55,13 @@ def drive(
     """
     flat, q, v, t0, params = problem.flat(caller)
     plain = loop = steps(flat._replace(factors=factors), problem.stepper, q, v, t0, params)
-    if events is not None or flat.contact is not None:
+    if events is not None:
         pieces = {"in_pieces": between, "with_modes": problem.output is not None}
-        loop = loop_with_events(plain, flat, problem.stepper, events or (), params, *(room or ROOM), **pieces)
+        loop = loop_with_events(plain, flat, problem.stepper, events, params, *room, **pieces)
     form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)  # without events, which are seldom
     (_, _, failure, *met), solution = sampling(Run(problem, flat, params, loop, form))
     run = solution(with_flaw(failure, flaw_at_start(problem.system, flat, loop.start, params)))
-    return with_told_events(flat, run, form.joined(met[0]), (room or ROOM)[1]) if met else run
+    return with_told_events(flat, run, form.joined(met[0]), room[1]) if met else run
 
 
 class Run(NamedTuple):

@@ -24,7 +24,7 @@ from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.primitives import staged
 from hhtjax.runs.solution import ALONG, CORNER, FINE, MANY, NEGATIVE, NO_NUMBER, SINGULAR, STAYS, THROWN, row_of
 from hhtjax.steppers.stepper import behind_jump, entered, join_info
-from hhtjax.steppers.variable_step import resized_step
+from hhtjax.steppers.variable_step import drifted, resized_step
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.sampled import SLOP
 
@@ -128,7 +128,7 @@ def meet(context: EventContext, now: tuple, found: Found, h: Array, params: PyTr
     rate = pick(this, d)
     missed = ~(jnp.abs(pick(this, g)) <= beside_zero(rate, h, pick(this, found.size)))
     missed = missed & ~(pick(this, found.jumped.astype(h.dtype)) > 0)
-    v, modes = events.outcome(i, e, now, events.with_modes(params, met.modes), h)
+    v, modes = events.outcome(i, e, now, events.with_modes(params, met.modes))
     row = row_of(e.t, i, rate, e.q, e.v, v)
 
     over = events.passed(i, met.over)
@@ -171,7 +171,6 @@ def behind(
     due = jnp.where(going_on, part.due, near_and_due) & ~(this > 0)
     same = (jnp.abs(d1 - d) <= nearness(h) * jnp.abs(d)) & (jnp.abs(g1 - g) <= nearness(h) * h * jnp.abs(d))
     same = same | jnp.asarray(events.timed)  # nothing changes those
-    same = same | events.closed(start)  # by the same impact
     corner = jnp.any(beside & ~(this > 0) & ~same)  # in another order they might have other outcomes
     code = jnp.where(corner, CORNER, jnp.where(jnp.all(jnp.isfinite(v)), FINE, ALONG))
     if context.flat.num_constraints:
@@ -290,12 +289,6 @@ def reaching(flat: FlatSystem, stepper: Stepper, no_info: Info):
         return tree_where(short, drifted(flat, s, tau), s1), tree_where(short, no_info, info)
 
     return reach
-
-
-def drifted(flat: FlatSystem, s: State, h: Array) -> State:
-    """The state a very short time h later."""
-    s1 = s._replace(t=s.t + h, q=flat.move(s.q, h * (s.v + h / 2 * s.w)), v=s.v + h * s.w)
-    return flat.tidy(s1)
 
 
 # ----------------------------------------------------------------------------

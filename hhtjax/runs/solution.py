@@ -40,19 +40,26 @@ class ContactForces(NamedTuple):
         friction: (K + 1, m), those along the surfaces, positive against negative sliding.
         closed: (K + 1, m), whether bodies touch.
         sticking: (K + 1, m), whether they also stick.
+        impacts: (K + 1, m), how many impacts there have been.
+        rests_since: (m,), since when a contact that is closed in the end has been so, s; -inf: from the start on;
+            inf: it is open. Of one that bounced, the time at which infinitely many bounces would have ended.
     """
 
     normal: Array
     friction: Array
     closed: Array
     sticking: Array
+    impacts: Array
+    rests_since: Array
 
     @classmethod
     def of(cls, contact: ContactState) -> ContactForces:
         """Those of a state of a step."""
         m = contact.closed.shape[-1]
         closed = contact.closed > 0
-        return cls(contact.f[..., :m], contact.f[..., m:], closed, closed & (contact.sig == 0))
+        since = jnp.where(closed, contact.since, jnp.inf)[-1]
+        forces = contact.f[..., :m], contact.f[..., m:]
+        return cls(*forces, closed, closed & (contact.sig == 0), contact.impacts.astype(jnp.int32), since)
 
 
 @shown

@@ -1,14 +1,16 @@
-"""The generalised-alpha step with contacts that are closed: one factorisation, order 2 through every switch.
+"""The generalised-alpha step with contacts: those that are closed are modes of it, and it is divided where one switches.
 
 The residual holds the contact forces f0 of the start of the step; what they change by is answered linearly,
 
     w1 = wf + G df,    G = A^-1 J^T,    y1 = yf + h gamma' K df,    K = J G,
 
-f standing for the free step, with f0, and gamma' = gamma (1 - alpha_f)/(1 - alpha_m). The modes that contacts have at
-the start give df (contact_modes.py). Where that lets a contact pull, hold more than friction allows, or slide
-backwards, the step is gone through from switch to switch. Behind it q, v, w and a go along G to where the modes have
-them: gaps to 0, rates of what is held to 0, and accelerations onto the branch of the end, so that no jump enters the
-recursion.
+f standing for the free step, with f0, and gamma' = gamma (1 - alpha_f)/(1 - alpha_m). The modes of contacts give df
+(contact_modes.py). Behind it q, v, w and a go along G to where the modes have them: gaps to 0, rates of what is held to
+0, and accelerations to those of the forces.
+
+A step in which somebody lets go, breaks away, stops or lands is taken again, up to there; behind that instant
+accelerations and forces begin anew (contact_instant.py), with velocities behind an impact, and the rest of the step
+follows. When it happens is a function of both ends of the step tried first, with derivatives.
 """
 
 from __future__ import annotations
@@ -17,180 +19,154 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 
 from hhtjax.description import Array, PyTree
-from hhtjax.numerics.batched_cond import call_where
-from hhtjax.numerics.coulomb import SmallInverse, inverted
-from hhtjax.numerics.dense_lu import matvec
+from hhtjax.numerics.batched_cond import call_where, tree_where
+from hhtjax.numerics.checkpointed_scan import checkpoint
+from hhtjax.numerics.coulomb import PROXIMAL, inverted
+from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.steppers.constrained import report_constraints
-from hhtjax.steppers.contact_modes import (
-    FINE,
-    ROUNDING,
-    Course,
-    Modes,
-    Moment,
-    matrix,
-    right_side,
-    settled,
-    to_the_end,
-)
+from hhtjax.steppers.contact_instant import FINE, JAMMED, behind, touching
+from hhtjax.steppers.contact_modes import ROUNDING, Course, Modes, Switch, asks, first_switch, matrix, presses, right_side
 from hhtjax.steppers.friction import each_row, equations_of, free_step
-from hhtjax.steppers.stepper import ContactState
-from hhtjax.systems.constraints import answers, curvature
-from hhtjax.systems.contact import directions, rates, rates_of_rates, reaction, speeds
+from hhtjax.steppers.stepper import join_info
+from hhtjax.steppers.variable_step import drifted, moved
+from hhtjax.systems.contact import directions, rates, rates_of_rates, reaction
 from hhtjax.systems.friction import across
 
 if TYPE_CHECKING:
-    from hhtjax.steppers.stepper import State
+    from hhtjax.steppers.stepper import Info, State
     from hhtjax.systems.flat_system import FlatSystem
 
-CLOSED = 1e-9  # part of what moves in a step, within which the rate of a gap is 0
-TOUCHING = 1e-6  # the same of a gap: an event that is located to rounding of the time
+SWITCHES = 4, 2  # in a step, and for each contact
 CORRECTIONS = 2  # of the gap
-PENETRATES = 4.0  # the code of a step, as those of contact_modes.py
+MANY = 2.0  # the code of a step, beside those of contact_instant.py
 
 
 def begin_contact(method, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
     """The state at the start: who is closed, who sticks, and the accelerations of that."""
-    at = q, v, t, params
-    factorize = method.factorize_for(system) if system.num_constraints else method.factorize
-    answer = answers(system, q, t, params, factorize=factorize)
-    w, _ = answer(system.force(*at), -curvature(system, *at) if system.num_constraints else None)
-    J, mu = directions(system, q, t, params), system.contact.friction(params)
-    G = jnp.stack([answer(row)[0] for row in J])
-    K, ydot = across(J, G), rates_of_rates(system, q, v, w, t, params)
-    modes, _ = settled(K, ydot, _touching(system, at, J, w, dt), mu)
-    f = inverted(matrix(K, modes, mu))(right_side(ydot, jnp.zeros_like(ydot), modes, mu))
-
-    def force(q: Array, v: Array, t: Array, params: PyTree) -> Array:
-        return system.force(q, v, t, params) + reaction(system, q, t, params, f)
-
-    s = method.begin(system._replace(force=force, contact=None), *at, dt)
-    return s._replace(contact=ContactState(f, *modes))
-
-
-def _touching(system: FlatSystem, at: tuple, J: Array, w: Array, h: Array) -> Modes:
-    """Contacts that are closed, but for those that the accelerations take apart, and who of them slides."""
-    q, v, t, params = at
-    m, gap, y = system.contact.size, system.contact.gap(q, t, params), rates(system, *at)
-    fast = speeds(J, v, w, h)
-    small = max(CLOSED, 1e3 * float(jnp.finfo(q.dtype).eps)) * fast
-    closed = (jnp.abs(gap) <= TOUCHING * h * fast) & (jnp.abs(y[:m]) <= small)
-    slides = closed & (jnp.abs(y[m:]) > small)
-    return Modes(closed.astype(q.dtype), jnp.where(slides, jnp.sign(y[m:]), 0))
-
-
-class End(NamedTuple):
-    """How contacts come out of a step: the modes, the integral of the rates over theta, the forces; by how much those
-    in the residual change, which rates are corrected by what, by what held ones are, and the code."""
-
-    modes: Modes
-    moved: Array
-    f: Array
-    df: Array
-    there: Array
-    of_path: SmallInverse
-    of_held: SmallInverse
-    code: Any
+    return touching(method, system, q, v, t, params, dt)
 
 
 def bind_contact(method, system: FlatSystem, params: PyTree, dt: Array):
-    """The step: the free one, what contacts make of it, and what becomes of the state behind that."""
-    mu, c, size = system.contact.friction(params), method.coefficients, system.size
-    lag = dt * c.gamma * (1 - c.alpha_f) / (1 - c.alpha_m)
+    """The step."""
+    mu = system.contact.friction(params)
 
     def step(s: State):
-        f0 = s.contact.f
-        r, path, z, shift, B = equations_of(method, system, params, dt, s)
-
-        def loaded(s1: State) -> Array:
-            push = reaction(system, s1.q, s1.t, params, f0)
-            return r(s1) - jnp.pad(push, (0, z.size - size))
-
-        factorize = method.factorize_for(system) if system.num_constraints else method.factorize
-        at = path(z)
-        z, info, inverse, _ = free_step(method.options, system, loaded, path, z, s, factorize, None)
-        J = directions(system, at.q, at.t, params)
-        answers = each_row(inverse, jnp.pad(J, ((0, 0), (0, z.size - size))))
-        G = answers[:, :size]
-        K, yf = across(J, G), rates(system, at.q, path(z).v, at.t, params)
-        end = _end(s.contact, K, rates(system, s.q, s.v, s.t, params), yf, mu, lag, dt)
-        z = z + matvec(answers.T, end.df)
-        x = method.advance(s, dt, z[:size])[0]
-        if shift is not None and (taken := shift(z[size + system.num_constraints :])) is not None:
-            x = x - taken
-        s1 = system.tidy(_behind(system, params, dt, s, path(z), x, end, answers, J, f0, mu))
-        through = _goes_through(system, params, dt, s1, J, mu)
-        info = info._replace(contact=jnp.maximum(end.code, jnp.where(through, PENETRATES, FINE).astype(dt.dtype)))
-        return s1, info if B is None else report_constraints(method, system, params, dt, s, s1, info, B)
+        s1, info, course = _part(method, system, params, s, dt)
+        switches = jnp.any(jnp.concatenate(asks(course, Modes(s.contact.closed, s.contact.sig), mu)))
+        return call_where(partial(_in_parts, method, system, params), switches, (s1, info), s, dt)
 
     return step
 
 
-def _goes_through(system: FlatSystem, params: PyTree, h: Array, s: State, J: Array, mu: Array) -> Array:
-    """Whether bodies that do not touch are in each other."""
-    m, gap = system.contact.size, system.contact.gap(s.q, s.t, params)
-    small = max(CLOSED, 1e3 * float(jnp.finfo(gap.dtype).eps)) * h * matvec(jnp.abs(J), jnp.abs(s.v))[:m]
-    return jnp.any((s.contact.closed == 0) & (gap < -small))
+class Way(NamedTuple):
+    """What is left of a step: from `start`, of the size `rest`; the next part has the size `aim`, and ends with a
+    switch, if there is one. end: of the whole, once it is `done`."""
+
+    start: Any
+    rest: Array
+    aim: Array
+    switch: Switch
+    end: Any
+    info: Info
+    done: Array
 
 
-def _end(s: ContactState, K: Array, y0: Array, yf: Array, mu: Array, lag: Array, h: Array) -> End:
-    """How contacts come out of a step. y0: rates at its start; yf: those at its end with the forces of the start; lag:
-    what K is multiplied by in between."""
-    m, modes, f0 = len(mu), Modes(s.closed, s.sig), s.f
-    closed, stuck, slides = modes.which(mu)
+def _in_parts(method, system: FlatSystem, params: PyTree, found: tuple, s: State, h: Array):
+    """The step h from s, divided where contacts switch."""
+    end, info = found
+    way = Way(s, h, h, Switch.none(s.contact.closed), end, info, jnp.zeros_like(h))
+
+    @checkpoint
+    def visit(way: Way, _):
+        return call_where(partial(_go_on, method, system, params), way.done == 0, way, h), None
+
+    first, more = SWITCHES
+    way = lax.scan(visit, way, length=1 + 2 * (first + more * system.contact.size))[0]
+    end = way.end._replace(t=s.t + h, a=way.end.w)
+    code = jnp.where((way.done == 0) & (way.info.contact == FINE), MANY, way.info.contact)
+    return end, way.info._replace(contact=code)
+
+
+def _go_on(method, system: FlatSystem, params: PyTree, way: Way, h: Array) -> Way:
+    """The next part of a step h: to its end, or, if somebody switches before, a shorter one to be tried next."""
+    s, aim = way.start, way.aim
+    short = h * np.sqrt(float(jnp.finfo(h.dtype).eps))
+    size = jnp.maximum(aim, short)
+    s1, info, course = _part(method, system, params, moved(s, size / h), size)
+    theta, switch = first_switch(course, Modes(s.contact.closed, s.contact.sig), system.contact.friction(params))
+    s1 = tree_where(aim <= short, drifted(system, s, aim), s1)
+    switches = way.switch.any()
+    fails = ~switches & (theta < 1) & (aim > short)
+    s2, late, code = call_where(
+        partial(behind, method, system, params), switches, (s1, jnp.zeros_like(h), info.contact), way.switch, h
+    )
+    info = info._replace(contact=jnp.maximum(info.contact, code))
+    start = tree_where(switches, s2, s)
+    rest = jnp.where(switches, way.rest - aim - late, way.rest)
+    aim = jnp.where(fails, theta * aim, rest)
+    none = Switch.none(s.contact.closed)
+    done = (~switches & ~fails).astype(h.dtype)
+    info = tree_where(fails, way.info, join_info(way.info, info))
+    return Way(start, rest, aim, tree_where(fails, switch, none), tree_where(done > 0, s1, s2), info, done)
+
+
+def _part(method, system: FlatSystem, params: PyTree, s: State, h: Array):
+    """The step h from s in which all contacts keep their modes, its `Info`, and its `Course`."""
+    mu, c, size, n = system.contact.friction(params), method.coefficients, system.size, system.num_constraints
+    lag = h * c.gamma * (1 - c.alpha_f) / (1 - c.alpha_m)
+    gap, y, m = partial(system.contact.gap, params=params), partial(rates, system, params=params), len(mu)
+    modes, f0 = Modes(s.contact.closed, s.contact.sig), s.contact.f
     held = modes.held(mu)
-    y0 = jnp.where(held, 0, y0)
-    of_held = inverted(matrix(K, modes, mu))
-    df = of_held(right_side(yf / lag, f0, modes, mu))
-    y1, f1 = jnp.where(held, 0, yf + lag * matvec(K, df)), f0 + df
-    noise = ROUNDING * float(jnp.finfo(f1.dtype).eps) * jnp.max(jnp.abs(f1))
-    good = jnp.all(~closed | (f1[:m] >= -noise)) & jnp.all(~stuck | (jnp.abs(f1[m:]) <= mu * f1[:m] + noise))
-    good = good & jnp.all(~slides | (mu == 0) | (modes.sig * y1[m:] >= 0))
-    steady = End(modes, (y0 + y1) / 2, f1, df, held, of_held, of_held, jnp.zeros_like(h))
+    closed = held[:m]
+    r, path, z, shift, B = equations_of(method, system, params, h, s)
 
-    def switches(steady: End, y0: Array, yf: Array, y1: Array, f0: Array, K: Array) -> End:
-        begin = Moment(jnp.zeros_like(h), y0, steady.modes, jnp.zeros_like(y0), f0, jnp.zeros_like(h))
-        at = to_the_end(begin, Course(y1 - y0, f0, steady.df, h * K, mu))
-        there = jnp.concatenate([closed, closed & (mu > 0)])
-        block = inverted(jnp.where(there[:, None] & there[None, :], K, jnp.eye(2 * m, dtype=K.dtype)))
-        df = block(jnp.where(there, (at.y - yf) / lag, 0))
-        return End(at.modes, at.moved, at.f, df, there, block, inverted(matrix(K, at.modes, mu)), at.code)
+    def loaded(s1: State) -> Array:
+        push = reaction(system, s1.q, s1.t, params, f0)
+        return r(s1) - jnp.pad(push, (0, z.size - size))
 
-    return call_where(switches, ~good, steady, y0, yf, y1, f0, K)
+    factorize = method.factorize_for(system) if n else method.factorize
+    at = path(z)
+    z, info, inverse, _ = free_step(method.options, system, loaded, path, z, s, factorize, None)
+    J = directions(system, at.q, at.t, params)
+    answers = each_row(inverse, jnp.pad(J, ((0, 0), (0, z.size - size))))
+    K = across(J, answers[:, :size])
+    change = inverted(matrix(K, modes, mu))
+    df = change(right_side(y(at.q, path(z).v, at.t) / lag, f0, modes, mu))
 
-
-def _behind(
-    system: FlatSystem,
-    params: PyTree,
-    h: Array,
-    s: State,
-    s1: State,
-    x: Array,
-    end: End,
-    answers: Array,
-    J: Array,
-    f0: Array,
-    mu: Array,
-) -> State:
-    """The state s1 at the end of the step, displaced by x, moved to where the modes of its end have it."""
-    n, size = system.num_constraints, system.size
-    gap, y = system.contact.gap, partial(rates, system, params=params)
-    closed, *_ = end.modes.which(mu)
-    held = end.modes.held(mu)
-    Gv = system.widened(answers[:, : system.positions])  # internal states do not jump
-    moved = h * y(system.move(s.q, x / 2), x / h, s.t + h / 2)
-    x = x + matvec(Gv.T, end.of_path(jnp.where(end.there, h * end.moved - moved, 0)))
+    z = z + matvec(answers.T, df)
+    x, s1 = method.advance(s, h, z[:size])[0], path(z)
+    if shift is not None and (taken := shift(z[size + n :])) is not None:
+        x = x - taken
+    Gv = system.widened(answers[:, : system.positions]).T  # internal states do not jump
+    slid = h * y(system.move(s.q, x / 2), x / h, s.t + h / 2)[m:]
     for _ in range(CORRECTIONS):
-        open_by = jnp.where(closed, gap(system.move(s.q, x), s1.t, params), 0)
-        x = x - matvec(Gv.T, end.of_held(jnp.concatenate([open_by, jnp.zeros_like(open_by)])))
+        open_by = gap(system.move(s.q, x), s1.t)
+        x = x - matvec(Gv, change(jnp.where(held, jnp.concatenate([open_by, slid]), 0)))
+        slid = jnp.zeros_like(slid)
     q = system.move(s.q, x)
-    v = s1.v - matvec(Gv.T, end.of_held(jnp.where(held, y(q, s1.v, s1.t), 0)))
-    jump = end.f - f0 - end.df
-    w = s1.w + matvec(Gv.T, jump)
-    change = end.of_held(right_side(rates_of_rates(system, q, v, w, s1.t, params), end.f, end.modes, mu))
-    w = w + matvec(Gv.T, change)
-    a = s1.a - matvec(Gv.T, end.of_path(jnp.where(end.there, matvec(J, s1.a - w), 0)))
-    if s1.L is not None:
-        s1 = s1._replace(L=s1.L + matvec(answers[:, size : size + n].T, jump + change))
-    return s1._replace(q=q, v=v, w=w, a=a, contact=ContactState(end.f + change, *end.modes))
+    y1 = y(q, s1.v, s1.t)
+    v = s1.v - matvec(Gv, change(jnp.where(held, y1, 0)))
+    more = change(right_side(rates_of_rates(system, q, v, s1.w, s1.t, params), f0 + df, modes, mu))
+    w = s1.w + matvec(Gv, more)
+    a = s1.a - matvec(Gv, change(jnp.where(held, matvec(J, s1.a - w), 0)))
+    f1 = f0 + df + more
+    L = None if s1.L is None else s1.L + matvec(answers[:, size : size + n].T, more)
+    s1 = system.tidy(s1._replace(q=q, v=v, w=w, a=a, L=L, contact=s.contact._replace(f=f1)))
+
+    gaps = tuple(jnp.where(closed, 0, gap(x.q, x.t)) for x in (s, s1))
+    ends = tuple(jnp.where(held, 0, x) for x in (y(s.q, s.v, s.t), y1))
+    course = Course(h, gaps, ends, (f0, f1), _roundings(s1, J, f1))
+    jams = jnp.any(closed & (presses(K, modes, mu) <= PROXIMAL * jnp.abs(diagonal(K)[:m])))
+    info = info._replace(contact=jnp.where(jams, JAMMED, FINE).astype(h.dtype))
+    return s1, info if B is None else report_constraints(method, system, params, h, s, s1, info, B), course
+
+
+def _roundings(s: State, J: Array, f: Array):
+    """What gaps, rates and forces may be beyond 0."""
+    few, m = ROUNDING * float(jnp.finfo(f.dtype).eps), len(J) // 2
+    along = matvec(jnp.abs(J), jnp.abs(s.v))[m:]
+    return few * jnp.sum(jnp.abs(J[:m]), axis=1) * jnp.max(jnp.abs(s.q)), few * along, few * jnp.max(jnp.abs(f))

@@ -1,31 +1,26 @@
-"""What contacts do within a step, on their rates y = (dg/dt, s) alone: who is closed, who sticks, who slides where to.
+"""Modes of contacts: who is closed, who sticks, who slides where to; and when, within a step, the first of them switches.
 
-With modes all is linear in the forces f = (f_N, f_T): to rates that they change by A f, added to y,
+With modes the forces f = (f_N, f_T) answer to rates y = (dg/dt, s), or to their derivatives, linearly,
 
-    closed: (y + A f)_N = 0      sticking: (y + A f)_T = 0      sliding: f_T = -sig mu f_N      open: f = 0
+    closed: (y + K f)_N = 0      sticking: (y + K f)_T = 0      sliding: f_T = -sig mu f_N      open: f = 0
 
-A step in which nobody switches is one such problem. One with switches is gone through from switch to switch. Between
-them the forces go linearly: a closed contact lets go where f_N falls to 0, one that sticks breaks away where |f_T|
-grows to mu f_N, one that slides stops where s = 0. Behind each of these the modes of all contacts are a linear
-complementarity problem: what one does may move the others.
+A closed contact lets go where f_N falls below 0, one that sticks breaks away where |f_T| grows beyond mu f_N, one that
+slides stops where s = 0, and an open one lands where its gap falls to 0. Between both ends of a step f and s are taken
+for lines, and gaps for cubics, which is what order 2 needs.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
 from hhtjax.description import Array
-from hhtjax.numerics.batched_cond import call_where
-from hhtjax.numerics.coulomb import choice, inverted
-from hhtjax.numerics.dense_lu import matvec
 
-SWITCHES = 4, 2  # in a step, and for each contact
-ROUNDING = 64  # of the largest force, that a force may be beyond what its mode allows
-FINE, NO_FORCES, MANY, JAMMED = 0.0, 1.0, 2.0, 3.0  # codes of a step
+ROUNDING = 64  # of what a force, a rate or a gap is made of, that it may be beyond what its mode allows
+ON_CUBIC, NEARLY = 40, 1e-9  # iterations at most, and the change of theta that is the last
+TOGETHER = 1e-9  # part of a step: two switches that are one
 
 
 class Modes(NamedTuple):
@@ -44,6 +39,11 @@ class Modes(NamedTuple):
         """(2 m,): which rates are 0."""
         closed, stuck, _ = self.which(mu)
         return jnp.concatenate([closed, stuck])
+
+    def behind(self, switch: Switch) -> Modes:
+        """Those behind a switch, but for landings."""
+        sig = jnp.where(switch.breaks != 0, -switch.breaks, jnp.where(switch.stops > 0, 0, self.sig))
+        return Modes(self.closed * (1 - switch.lets), sig)
 
 
 def matrix(A: Array, modes: Modes, mu: Array) -> Array:
@@ -64,92 +64,115 @@ def right_side(y: Array, f: Array, modes: Modes, mu: Array) -> Array:
     return jnp.concatenate([jnp.where(closed, -y[:m], -f[:m]), jnp.where(stuck, -y[m:], along)])
 
 
-def settled(K: Array, y: Array, modes: Modes, mu: Array):
-    """The modes behind an instant, of contacts that are closed, and stick or slide as `modes` say, there: who lets go,
-    and who begins to slide; and the code. y: dy/dt without forces, K: what a unit of force adds to it."""
-    closed, _, slides = modes.which(mu)
-    found = choice(K, y, mu, jnp.zeros_like(mu), closed, jnp.where(slides, modes.sig, 0))
-    code = jnp.where(found.jams, JAMMED, jnp.where(found.found, FINE, NO_FORCES)).astype(y.dtype)
-    return Modes(found.pushes.astype(y.dtype), jnp.where(found.pushes, found.sig, 0)), code
+def presses(K: Array, modes: Modes, mu: Array) -> Array:
+    """(m,): what normal force does to the gap of each contact with its friction. Where that is not positive the contact
+    jams (Painleve)."""
+    m = len(mu)
+    return jnp.stack([K[i, i] - modes.sig[i] * mu[i] * K[i, m + i] for i in range(m)])
+
+
+class Switch(NamedTuple):
+    """Which contacts switch at an instant, (m,): 1 where one lets go, stops or lands; and the sign of the friction that
+    one which breaks away had. 0 elsewhere."""
+
+    lets: Array
+    breaks: Array
+    stops: Array
+    lands: Array
+
+    @classmethod
+    def none(cls, like: Array) -> Switch:
+        """Of nobody."""
+        return cls(*[jnp.zeros_like(like)] * 4)
+
+    def any(self) -> Array:
+        """Whether there is one."""
+        return jnp.any((self.lets + jnp.abs(self.breaks) + self.stops + self.lands) > 0)
 
 
 class Course(NamedTuple):
-    """A step in which nobody switches: its dy/dtheta, theta = (t - t0)/h, its forces, start + theta rise; and what a
-    unit of force changes y by in the time h."""
+    """A step h in which nobody switched: the gaps, rates and forces at its start and at its end; and what of each is
+    rounding."""
 
-    slope: Array
-    start: Array
-    rise: Array
-    Kh: Array
-    mu: Array
-
-
-class Moment(NamedTuple):
-    """Within a step: theta, the rates, the modes, the integral of the rates over theta, the forces, the code."""
-
-    theta: Array
-    y: Array
-    modes: Modes
-    moved: Array
-    f: Array
-    code: Any
+    h: Array
+    gap: tuple
+    y: tuple
+    f: tuple
+    rounding: tuple
 
 
-def to_the_end(at: Moment, course: Course) -> Moment:
-    """The end of the step, behind all switches."""
-
-    def visit(at: Moment, _):
-        return call_where(piece, at.theta < 1, at, course), None
-
-    first, more = SWITCHES
-    at = lax.scan(visit, at, length=first + more * len(course.mu))[0]
-    many = (at.theta < 1) & (at.code == FINE)
-    return at._replace(code=jnp.where(many, MANY, at.code).astype(at.y.dtype))
-
-
-def piece(at: Moment, course: Course) -> Moment:
-    """On to the next switch, or to the end of the step."""
-    slope, start, rise, Kh, mu = course
-    m = len(mu)
-    soon = at.theta + np.sqrt(float(jnp.finfo(slope.dtype).eps)) * (1 - at.theta)
-    modes, code = settled(Kh, slope - matvec(Kh, start + soon * rise), at.modes, mu)
-    change = inverted(matrix(Kh, modes, mu))
-    first, last = (known + change(right_side(slope, known, modes, mu)) for known in (start, start + rise))
-
-    def force(theta: Array) -> Array:
-        return first + theta * (last - first)
-
-    middle = (1 + at.theta) / 2
-    held = modes.held(mu)
-    speed = jnp.where(held, 0, slope + matvec(Kh, force(middle) - (start + middle * rise)))
-    y = jnp.where(held, 0, at.y)
-    until, stops = _first_switch(at.theta, y, speed, first, last, modes, mu)
-    theta = jnp.minimum(until, 1)
-    y1 = y + (theta - at.theta) * speed
-    who = (stops <= until) & (until < 1)
-    y1 = jnp.concatenate([y1[:m], jnp.where(who, 0, y1[m:])])
-    moved = at.moved + (theta - at.theta) * (y + y1) / 2
-    modes = modes._replace(sig=jnp.where(who, 0, modes.sig))
-    return Moment(theta, y1, modes, moved, force(theta), jnp.maximum(at.code, code))
-
-
-def _first_switch(theta: Array, y: Array, speed: Array, first: Array, last: Array, modes: Modes, mu: Array):
-    """When the first contact switches, infinite where none does; and when each of those that slide stops."""
+def asks(course: Course, modes: Modes, mu: Array):
+    """Who cannot stay as it is to the end of the step: lets go, breaks away, stops, lands (m,). Of those whose gap turns
+    around, the last may yet be wrong."""
     m = len(mu)
     closed, stuck, slides = modes.which(mu)
+    of_gap, of_rate, of_force = course.rounding
+    (f_N, f_T), s = (course.f[1][:m], course.f[1][m:]), course.y[1][m:]
+    (g0, g1), (d0, d1) = course.gap, (course.h * y[:m] for y in course.y)
+    lets, breaks = closed & (f_N < -of_force), stuck & (jnp.abs(f_T) > mu * f_N + of_force)
+    stops = slides & (mu > 0) & (modes.sig * s < -of_rate)
+    crosses = g0 * (d1 - d0) <= d0 * (g1 - g0 - d1)  # tangents at both ends cross below 0
+    return lets, breaks, stops, ~closed & ((g1 < -of_gap) | ((d0 < 0) & (d1 > 0) & crosses))
 
-    noise = ROUNDING * float(jnp.finfo(y.dtype).eps) * jnp.max(jnp.abs(first) + jnp.abs(last))
 
-    def crossing(a: Array, b: Array, some: Array) -> Array:
-        """Where what goes from a to b falls below 0, by more than rounding in the end."""
-        falls = some & (b < -noise) & (b < a)
-        there = a / jnp.where(falls, a - b, 1)
-        return jnp.where(falls, jnp.where(there > theta, there, theta), jnp.inf)
+def first_switch(course: Course, modes: Modes, mu: Array):
+    """When the first contact switches, as a part of the step, infinite where none does; and the `Switch`."""
+    m = len(mu)
+    lets, breaks, stops, lands = asks(course, modes, mu)
+    f_N, f_T = ([f[part] for f in course.f] for part in (slice(m), slice(m, None)))
+    side = jnp.sign(f_T[1])
+    left = [mu * N - side * T for N, T in zip(f_N, f_T, strict=True)]
+    times = [
+        _on_line(*f_N, lets),
+        _on_line(*left, breaks),
+        _on_line(*(modes.sig * y[m:] for y in course.y), stops),
+        _on_cubic(course, lands),
+    ]
+    flat = jnp.concatenate(times)
+    first = jnp.arange(4 * m) == jnp.argmin(lax.stop_gradient(flat))
+    theta = jnp.sum(jnp.where(first, flat, 0))
+    now = [(t <= theta + TOGETHER) & (t < 1) for t in times]
+    lets, breaks, stops, lands = (x.astype(mu.dtype) for x in now)
+    return theta, Switch(lets, breaks * side, stops, lands)
 
-    limits = [mu * f[:m] for f in (first, last)]
-    times = [crossing(first[:m], last[:m], closed)]
-    times += [crossing(limits[0] - d * first[m:], limits[1] - d * last[m:], stuck) for d in (1, -1)]
-    turning = slides & (mu > 0) & (modes.sig * speed[m:] < 0)
-    wait = -y[m:] / jnp.where(turning, speed[m:], 1)
-    stops = jnp.where(turning, theta + jnp.where(wait > 0, wait, 0), jnp.inf)
-    return jnp.min(jnp.stack([*times, stops])), stops
+
+def _on_line(a: Array, b: Array, some: Array) -> Array:
+    """Where what goes from a to b < 0 is 0; infinite for others."""
+    some = some & (b < 0)
+    a = jnp.maximum(a, 0)
+    return jnp.where(some, a / jnp.where(some, a - b, 1), jnp.inf)
+
+
+def _on_cubic(course: Course, some: Array) -> Array:
+    """Where gaps fall to 0, on the cubics through both ends; infinite where they do not."""
+    m = len(some)
+    (g0, g1), (d0, d1) = course.gap, (course.h * y[:m] for y in course.y)
+    a, b = 3 * (g1 - g0) - 2 * d0 - d1, 2 * (g0 - g1) + d0 + d1
+
+    def cubic(x: Array) -> Array:
+        return g0 + x * (d0 + x * (a + x * b))
+
+    root = jnp.sqrt(jnp.maximum(a * a - 3 * b * d0, 0))
+    below = jnp.where(d0 > 0, a - root, a + root)
+    turn = -d0 / jnp.where(below != 0, below, 1)  # the first place where it turns around
+    turn = jnp.where((below != 0) & (turn > 0) & (turn < 1), turn, 1)
+    ends = g1 < -course.rounding[0]
+    some = some & (ends | (cubic(turn) < -course.rounding[0]))
+    bounds = jnp.where((d0 > 0) & ends, turn, 0), jnp.where(ends, 1, turn)
+
+    def unfinished(now: tuple) -> Array:
+        *_, change, k = now
+        return (change > NEARLY) & (k < ON_CUBIC)
+
+    def improve(now: tuple):
+        low, high, x, _, k = now
+        y, slope = cubic(x), d0 + x * (2 * a + x * 3 * b)
+        low, high = jnp.where(y > 0, x, low), jnp.where(y > 0, high, x)
+        new = x - y / jnp.where(slope < 0, slope, -1)
+        new = jnp.where((slope < 0) & (new > low) & (new < high), new, (low + high) / 2)
+        return low, high, new, jnp.max(jnp.where(some, jnp.abs(new - x), 0)), k + 1
+
+    begin = *bounds, (bounds[0] + bounds[1]) / 2, jnp.ones_like(course.h), jnp.zeros((), jnp.int32)
+    x = lax.stop_gradient(lax.while_loop(unfinished, improve, lax.stop_gradient(begin))[2])
+    slope = lax.stop_gradient(d0 + x * (2 * a + x * 3 * b))
+    return jnp.where(some, jnp.clip(x - cubic(x) / jnp.where(slope < 0, slope, -jnp.inf), 0, 1), jnp.inf)

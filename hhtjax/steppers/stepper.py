@@ -62,11 +62,15 @@ class ContactState(NamedTuple):
         f: (2 m,), the forces: normal ones, positive where they push, then those along the surfaces.
         closed: (m,), 1 where bodies touch, else 0.
         sig: (m,), the direction in which a closed contact slides: -1, 1, or 0 where it sticks.
+        since: (m,), since when a closed contact is that, -inf from the start on.
+        impacts: (m,), how often bodies have met there.
     """
 
     f: Array
     closed: Array
     sig: Array
+    since: Array
+    impacts: Array
 
 
 @shown

@@ -85,6 +85,12 @@ def adapted(c: Coefficients, r: Array) -> Coefficients:
     })  # fmt: skip
 
 
+def drifted(flat: FlatSystem, s: State, h: Array) -> State:
+    """The state a very short time h later."""
+    s1 = s._replace(t=s.t + h, q=flat.move(s.q, h * (s.v + h / 2 * s.w)), v=s.v + h * s.w)
+    return flat.tidy(s1)
+
+
 def resized_step(flat: FlatSystem, stepper: Stepper, params: PyTree, dt: Array, last: Array, grows: bool = False):
     """State -> (State, Info) for a step dt after one of another size; grows: whether it may be far longer."""
 

@@ -23,7 +23,6 @@ from hhtjax.checks import in_words, require_function, require_number
 from hhtjax.description import Array, Description, PyTree, Real, as_float, freeze, is_array, is_concrete, is_real, thaw
 from hhtjax.numerics.batched_cond import call_where
 from hhtjax.primitives import consistent
-from hhtjax.systems import landing
 from hhtjax.systems.constraints import answers, pull_back
 from hhtjax.systems.sampled import SLOP
 
@@ -233,7 +232,7 @@ class FlatEvents(NamedTuple):
     """Events of a system on vectors; made by `flatten_events`. E is their number."""
 
     values: Callable  # state, params, the next of the known times -> (E,)
-    outcome: Callable  # i, state, params in this step, params, size of a step -> v, and the modes after event i
+    outcome: Callable  # i, state, params in this step, params -> v, and the modes after event i
     noted: tuple  # (E,), whether it changes nothing
     ends: tuple  # (E,), whether the run ends there
     forced: tuple  # (E,), whether its guard is one of multipliers, which may jump
@@ -241,13 +240,6 @@ class FlatEvents(NamedTuple):
     switches: bool  # whether one of them changes params
     modes: Callable  # params -> a list of those of its numbers that a switch changes
     with_modes: Callable  # params, modes -> params
-
-    def closed(self, s) -> Array:
-        """(E,), whether it is a contact, and that is closed."""
-        E = len(self.noted)
-        if s.contact is None:
-            return jnp.zeros(E, bool)
-        return jnp.concatenate([jnp.zeros(E - len(s.contact.closed), bool), s.contact.closed > 0])
 
     @property
     def timed(self):
@@ -327,8 +319,7 @@ def flatten_events(system: FlatSystem, events: tuple, params: PyTree, at: tuple,
     def values(s, params: PyTree, due) -> Array:
         due = iter(due)
         values = [next(due) - s.t if guard is None else guard(s.q, s.v, s.t, s.L, params) for guard in guards]
-        values = [jnp.asarray(g).astype(s.v.dtype).reshape(1) for g in values]
-        return jnp.concatenate(values if system.contact is None else [*values, landing.guards(system, s, params)])
+        return jnp.stack([jnp.asarray(g).astype(s.v.dtype).reshape(()) for g in values])
 
     def modes(params: PyTree):
         leaves = jax.tree.leaves(params)
@@ -346,20 +337,15 @@ def flatten_events(system: FlatSystem, events: tuple, params: PyTree, at: tuple,
         new = [x.astype(y.dtype) for x, y in zip(modes(after), old, strict=True)]
         return _reset(system, event, redundant, q, v, t, now), new
 
-    def outcome(i: Array, s, now: dict | None, params: PyTree, h: Array):
+    def outcome(i: Array, s, now: dict | None, params: PyTree):
         after = s.v, modes(params)
-        if system.contact is not None:
-            met = lambda after, s, now, h: (landing.landed(system, s, now, h, redundant), after[1])  # noqa: E731
-            after = call_where(met, i >= len(events), after, s, now, h)
         for number, event in enumerate(events):
             if not event.is_noted:
                 after = call_where(partial(outcome_of, event), i == number, after, s.q, s.t, now, params)
         return after
 
     names = "is_noted", "terminal", "sees_multipliers"
-    landings = 0 if system.contact is None else system.contact.size
-    noted, ends, forced = (tuple(getattr(event, name) for event in events) + (False,) * landings for name in names)
-    times = times + (None,) * landings
+    noted, ends, forced = (tuple(getattr(event, name) for event in events) for name in names)
     return FlatEvents(values, outcome, noted, ends, forced, times, bool(changed), modes, with_modes)
 
 

@@ -1,0 +1,157 @@
+"""What contacts do at an instant: who is closed behind it, with what velocities, accelerations and forces.
+
+    impact:      v := v + M^-1 J^T (C + E)     by Poisson's law, compression and expansion (numerics/coulomb.py)
+    closing:     contacts whose flight would be shorter than a step stay down
+    modes:       of those that are down, by the complementarity problem of their accelerations
+    forces:      f, by these modes, and w = M^-1 (Q + J^T f)
+
+Poisson's law makes no energy; Newton's, with friction, can. A contact that touches one which is closed lands without
+restitution.
+
+References: F. Pfeiffer, C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996, Sec. 8; D. Stewart, J. Trinkle,
+Int. J. Numer. Methods Eng. 39, 1996, 2673-2691 (the complementarity problem).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax.numpy as jnp
+
+from hhtjax.description import Array, PyTree
+from hhtjax.numerics.coulomb import choice, impulses, inverted
+from hhtjax.numerics.dense_lu import diagonal, matvec
+from hhtjax.steppers.contact_modes import Modes, matrix, right_side
+from hhtjax.steppers.stepper import ContactState, State
+from hhtjax.steppers.variable_step import drifted
+from hhtjax.systems.constraints import answers, curvature
+from hhtjax.systems.contact import directions, rates, rates_of_rates, speeds
+from hhtjax.systems.friction import across
+
+if TYPE_CHECKING:
+    from hhtjax.steppers.contact_modes import Switch
+    from hhtjax.systems.flat_system import FlatSystem
+
+STILL = 1e-9  # part of what moves in a step, within which a rate is 0
+NEAR = 1e-6  # the same of a gap that is closed
+SHORT = 1.0  # steps: a flight that is shorter does not begin
+LATE = 0.1  # part of a step, by which a landing or a stop may be corrected
+COUPLED = 1e-9  # of what a force does to its own contact, that it does to another
+FINE, NO_FORCES, JAMMED, SEVERAL = 0.0, 1.0, 3.0, 4.0  # codes of a step
+
+
+class Place(NamedTuple):
+    """What contact forces do at a position: answer, force -> accelerations and multipliers; J; G = M^-1 J^T and the
+    multipliers that belong to it, by rows; K = J G."""
+
+    answer: Any
+    J: Array
+    G: Array
+    pulls: Any
+    K: Array
+
+
+def _place(method, system: FlatSystem, q: Array, t: Array, params: PyTree) -> Place:
+    factorize = method.factorize_for(system) if system.num_constraints else method.factorize
+    answer, J = answers(system, q, t, params, factorize=factorize), directions(system, q, t, params)
+    G, pulls = zip(*[answer(row) for row in J], strict=True)
+    G = jnp.stack(G)
+    return Place(answer, J, G, None if pulls[0] is None else jnp.stack(pulls), across(J, G))
+
+
+def touching(method, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, h: Array) -> State:
+    """The state at a start: contacts that touch are closed, but for those that the accelerations take apart."""
+    place, m = _place(method, system, q, t, params), system.contact.size
+    w, _ = _free(system, place, q, v, t, params)
+    fast = speeds(place.J, v, w, h)
+    y = rates(system, q, v, t, params)
+    down = (jnp.abs(system.contact.gap(q, t, params)) <= NEAR * h * fast) & (jnp.abs(y[:m]) <= _still(fast))
+    sig = jnp.where(jnp.abs(y[m:]) > _still(fast), jnp.sign(y[m:]), 0)
+    zero = jnp.zeros_like(fast)
+    s = State(t, q, v, w, w, contact=ContactState(jnp.zeros_like(y), zero, sig, zero - jnp.inf, zero))
+    return _anew(system, place, s, down, sig, params)[0]
+
+
+def behind(method, system: FlatSystem, params: PyTree, before: tuple, switch: Switch, h: Array):
+    """The state behind a switch, by how much later that is than the state before, and the code. h: the whole step."""
+    s, _, code = before
+    contact, m = system.contact, system.contact.size
+    late = _late(system, params, s, switch, h)
+    s = drifted(system, s, late)
+    q, v, t = s.q, s.v, s.t
+    place, y, mu = _place(method, system, q, t, params), rates(system, q, v, t, params), contact.friction(params)
+    fast, modes = speeds(place.J, v, s.w, h), Modes(s.contact.closed, s.contact.sig).behind(switch)
+    closed = modes.closed > 0
+    meets = (contact.gap(q, t, params) <= NEAR * h * fast) & (y[:m] < -_still(fast))
+    hits = ~closed & ((switch.lands > 0) | meets)
+    here = closed | hits
+    coupled = jnp.abs(place.K[:m, :m]) > COUPLED * jnp.abs(diagonal(place.K)[:m, None])
+    others = coupled & here[None, :] & ~jnp.eye(m, dtype=bool)
+    e = contact.restitution(params)
+    several = jnp.any(jnp.any(others & hits[None, :], axis=1) & hits & (e > 0))
+    e = jnp.where(hits & ~jnp.any(others, axis=1), e, 0)
+    struck = jnp.any(hits)
+    imp = impulses(place.K, y, mu, e, here & struck)
+    v, y = v + matvec(place.G.T, imp), y + matvec(place.K, imp)
+
+    w, _ = _free(system, place, q, v, t, params)
+    falling = -rates_of_rates(system, q, v, w, t, params)[:m]
+    flies = y[:m] > _still(fast)
+    down = here & (~flies | (2 * y[:m] <= SHORT * h * falling))
+    slides = jnp.where(jnp.abs(y[m:]) > _still(fast), jnp.sign(y[m:]), jnp.where(struck, 0, modes.sig))
+    slides = jnp.where(switch.stops > 0, 0, slides)
+    v = _held(place, Modes(down.astype(v.dtype), slides).held(mu), v, y)
+    # what would still bounce, infinitely often, rests behind all that
+    zeno = jnp.where(flies & down, 2 * y[:m] / jnp.where(down & flies, falling * (1 - e), 1), 0)
+    known = s.contact._replace(
+        since=jnp.where(closed, s.contact.since, t + zeno), impacts=s.contact.impacts + hits.astype(h.dtype)
+    )
+    s, found = _anew(system, place, s._replace(v=v, contact=known), down, slides, params)
+    code = jnp.maximum(code, jnp.where(several, SEVERAL, FINE))
+    return s, late, jnp.maximum(code, found).astype(h.dtype)
+
+
+def _late(system: FlatSystem, params: PyTree, s: State, switch: Switch, h: Array) -> Array:
+    """By how much later than at a state the gap of what lands, or the velocity of what stops, is 0: a Newton step, the
+    state being near."""
+    m = len(switch.lands)
+    y, ydot = rates(system, s.q, s.v, s.t, params), rates_of_rates(system, s.q, s.v, s.w, s.t, params)
+    some = jnp.concatenate([switch.lands, switch.stops]) > 0
+    value = jnp.concatenate([system.contact.gap(s.q, s.t, params), y[m:]])
+    slope = jnp.concatenate([jnp.minimum(y[:m], 0), ydot[m:]])
+    late = -value / jnp.where(slope == 0, jnp.inf, slope)
+    late = jnp.where(some & (jnp.abs(late) <= LATE * h), late, jnp.inf)
+    first = jnp.arange(2 * m) == jnp.argmin(late)
+    return jnp.sum(jnp.where(first & jnp.isfinite(late), late, 0))
+
+
+def _held(place: Place, held: Array, v: Array, y: Array) -> Array:
+    """The velocities with which the rates y that are held, (2 m,), are 0."""
+    S = jnp.where(held[:, None], place.K, jnp.eye(len(y), dtype=y.dtype))
+    return v + matvec(place.G.T, inverted(S)(jnp.where(held, -y, 0)))
+
+
+def _anew(system: FlatSystem, place: Place, s: State, down: Array, sig: Array, params: PyTree):
+    """The state with the modes, forces and accelerations of contacts that are down, and the code. sig: the directions
+    in which they slide, 0 of those that do not."""
+    q, v, t, mu = s.q, s.v, s.t, system.contact.friction(params)
+    w, L = _free(system, place, q, v, t, params)
+    ydot = rates_of_rates(system, q, v, w, t, params)
+    found = choice(place.K, ydot, mu, jnp.zeros_like(mu), down, jnp.where(down, sig, 0))
+    modes = Modes(found.pushes.astype(v.dtype), jnp.where(found.pushes, found.sig, 0))
+    f = inverted(matrix(place.K, modes, mu))(right_side(ydot, jnp.zeros_like(ydot), modes, mu))
+    w = w + matvec(place.G.T, f)
+    L = None if L is None else L + matvec(place.pulls.T, f)
+    known = s.contact._replace(f=f, closed=modes.closed, sig=modes.sig)
+    code = jnp.where(found.jams, JAMMED, jnp.where(found.found, FINE, NO_FORCES)).astype(v.dtype)
+    return s._replace(v=v, w=w, a=w, L=L, contact=known), code
+
+
+def _free(system: FlatSystem, place: Place, q: Array, v: Array, t: Array, params: PyTree):
+    """Accelerations and multipliers without contact forces."""
+    rows = (-curvature(system, q, v, t, params),) if system.num_constraints else ()
+    return place.answer(system.force(q, v, t, params), *rows)
+
+
+def _still(fast: Array) -> Array:
+    return max(STILL, 1e3 * float(jnp.finfo(fast.dtype).eps)) * fast
