@@ -17,7 +17,7 @@ from jax import lax
 
 from hhtjax.description import Array
 from hhtjax.numerics.complementarity import complement
-from hhtjax.numerics.dense_lu import diagonal, differentiable_inverse, matvec
+from hhtjax.numerics.dense_lu import diagonal, matvec, with_slope
 
 PROXIMAL = 1e-9  # of a row, added to its diagonal: contacts may depend on each other
 
@@ -26,7 +26,7 @@ class SmallInverse(NamedTuple):
     """b -> S^-1 b of a small matrix whose rows may depend on each other, for b that allow it."""
 
     S: Array
-    near: Array  # the inverse of S, a little regularised
+    near: Array  # the inverse of S, a little regularised, which is right to PROXIMAL
 
     def __call__(self, b: Array) -> Array:
         x = matvec(self.near, b)
@@ -36,9 +36,20 @@ class SmallInverse(NamedTuple):
 def inverted(S: Array) -> SmallInverse:
     """The `SmallInverse`; of one contact without regularisation."""
     if len(S) == 2:
-        return SmallInverse(S, differentiable_inverse(S))
+        return SmallInverse(S, with_slope(_eliminated, S))
     largest = reduce(jnp.maximum, jnp.abs(S).T)
-    return SmallInverse(S, differentiable_inverse(S + jnp.diag(PROXIMAL * largest)))
+    return SmallInverse(S, with_slope(_eliminated, S + jnp.diag(PROXIMAL * largest)))
+
+
+def _eliminated(S: Array) -> Array:
+    """S^-1 without a search for pivots: tangential rows first, which hold what is semidefinite, or a unit; behind them
+    the normal ones have a pivot unless a contact jams."""
+    n = len(S)
+    both = jnp.concatenate([S, jnp.eye(n, dtype=S.dtype)], axis=1)
+    for k in [*range(n // 2, n), *range(n // 2)]:
+        row = both[k] / both[k, k]
+        both = jnp.where((jnp.arange(n) == k)[:, None], row[None, :], both - both[:, k][:, None] * row[None, :])
+    return both[:, n:]
 
 
 class Choice(NamedTuple):

@@ -134,7 +134,7 @@ def _part(method, system: FlatSystem, params: PyTree, s: State, h: Array):
     J = directions(system, at.q, at.t, params)
     answers = each_row(inverse, jnp.pad(J, ((0, 0), (0, z.size - size))))
     K = across(J, answers[:, :size])
-    change = inverted(matrix(K, modes, mu))
+    change = partial(matvec, inverted(matrix(K, modes, mu)).near)
     df = change(right_side(y(at.q, path(z).v, at.t) / lag, f0, modes, mu))
 
     z = z + matvec(answers.T, df)
