@@ -14,6 +14,7 @@ from hhtjax.description import Description, Real, is_array, is_concrete, is_real
 
 if TYPE_CHECKING:
     from hhtjax.steppers.stepper import Stepper
+    from hhtjax.systems.system import AnySystem
 
 WITH_ESTIMATES = (
     "hht, newmark (gamma = 1/2), bossak, generalized_alpha, rosenbrock, rowda, rodas5p, extrapolated, tsit5, dopri5, "
@@ -131,8 +132,13 @@ def require_single(caller: str, control: Adaptive):
         raise ValueError(f"{caller}: tolerances must be numbers; arrays (B,), one for each member, are for `sweep`.")
 
 
-def require_controlled(caller: str, stepper: Stepper):
-    """An error for a stepper without an estimate."""
+def require_controlled(caller: str, stepper: Stepper, system: AnySystem):
+    """An error for a stepper without an estimate, or a system whose steps it does not judge."""
+    if system.contact is not None:
+        raise NotImplementedError(
+            f"{caller}: error control does not know `contact`, whose accelerations jump within steps: give `dt` as a "
+            "number, and halve it to see the error."
+        )
     if stepper.estimate_order is None:
         raise NotImplementedError(
             f"{caller}: {stepper.name} has no estimate of its error: give `dt` as a number, or take {WITH_ESTIMATES}."

@@ -433,7 +433,7 @@ def usual_step(t0: Real, times: np.ndarray) -> Real:
 
 def checked_times(caller: str, problem: Problem, times: PyTree, control: Adaptive) -> Real:
     """times, for a stepper that can be controlled."""
-    require_controlled(caller, problem.stepper)
+    require_controlled(caller, problem.stepper, problem.system)
     require_masses(caller, problem.system, "take steps without error control")
     require_single(caller, control)
     return require_sample_times(times, problem.t0, jax.tree.leaves(problem.q0)[0].dtype, caller)

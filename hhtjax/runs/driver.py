@@ -20,11 +20,12 @@ from hhtjax.numerics.batched_cond import if_any, tree_where
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.primitives import in_turn
 from hhtjax.runs.event_step import EventContext, EventState, Pieces, SubStep, asks, pass_events, reaching, unnoted
-from hhtjax.runs.solution import FINE, INTERNAL_STATE, ContactForces, Failure, Log, Solution
+from hhtjax.runs.solution import FINE, INTERNAL_STATE, APART, ContactForces, Failure, Log, Solution
 from hhtjax.steppers.friction_switching import is_settled
 from hhtjax.steppers.stepper import Info, bound, entered, join_info, public, step_start
 from hhtjax.steppers.variable_step import resized_step
 from hhtjax.systems import zero_order_hold
+from hhtjax.systems.contact_start import start_flaws
 from hhtjax.systems.events import flatten_events
 from hhtjax.systems.matrices import OF_VELOCITY, mass_flaw
 from hhtjax.systems.system import mass_reads_velocity
@@ -61,6 +62,7 @@ def drive(
     form = on_scalars(lambda carry: plain.advance(carry[:3]), loop.carry)  # without events, which are seldom
     (_, _, failure, *met), solution = sampling(Run(problem, flat, params, loop, form))
     run = solution(with_flaw(failure, flaw_at_start(problem.system, flat, loop.start, params)))
+    run = run if flat.contact is None else with_contact_start(run, flat, loop.start, params)
     return with_told_events(flat, run, form.joined(met[0]), room[1]) if met else run
 
 
@@ -231,6 +233,13 @@ def flaw_at_start(system, flat, start, params: PyTree):
         return flaw
     at = flat.unravel(start.q), flat.unravel_rates(flat.located(start.v)), start.t, thaw(params)
     return jnp.where((flaw == 0) & mass_reads_velocity(system.mass.lagrangian, *at), OF_VELOCITY, flaw)
+
+
+def with_contact_start(run: Solution, flat: FlatSystem, start: State, params: PyTree) -> Solution:
+    """The run, or one that has failed where bodies overlap at the start, or go into each other."""
+    flawed = jnp.any(start_flaws(flat, start.q, start.v, start.t, params) > 0)
+    step, code = jnp.where(flawed, 1, run.failure.step), jnp.where(flawed, APART, run.failure.contact)
+    return run._replace(failure=run.failure._replace(step=step, contact=code))
 
 
 def no_failure(info: Info) -> Failure:

@@ -32,6 +32,7 @@ from hhtjax.steppers.stepper import require_capable, require_stepper, require_sy
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.affine import require_affine
 from hhtjax.systems.events import Event, Impact, flatten_events, require_times
+from hhtjax.systems.contact_start import require_contact_start
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.held_nodes import require_held_start
 from hhtjax.systems.initial_conditions import initial_values, require_consistent, with_known_rows
@@ -84,6 +85,8 @@ class Problem(NamedTuple):
         if system.friction is not None:
             system = with_known_rows(caller, system, q0, v0, t0, params, z0)
         require_held_start(caller, system, q0, v0, t0, params)
+        if system.contact is not None:
+            require_contact_start(caller, system, q0, v0, t0, params, z0)
         if system.constraint is not None:
             require_consistent(caller, system, q0, v0, t0, params, stepper.redundant, z0)
         t0 = float(t0) if is_concrete(t0) else t0  # other number types would be compiled anew

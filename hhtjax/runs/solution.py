@@ -120,13 +120,16 @@ QUANTITIES = (
     "the internal state z", "the rate of the internal state z",
 )  # fmt: skip
 MASS = (None, "symmetric", "positive definite", "the same at all velocities")
+APART = 5
 CONTACT = {  # what went wrong with contacts, by the code of a step
     1: "no contact forces were found that neither pull nor hold more than friction allows. Take a smaller dt, or less "
     "`friction`",
     2: "contacts let go, stick and slide too often within the step. Take a smaller dt",
     3: "a contact jams: with so much friction, more normal force presses the bodies together (Painleve). Take less "
     "`friction`, or compliance in `force`",
-    4: "bodies go through each other within the step, as where a contact lets go and returns. Take a smaller dt",
+    4: "bodies that touch each other meet at several contacts at once, with a `restitution` above 0: what they do then "
+    "depends on the order. Take restitution 0",
+    5: "at the start bodies overlap, or touch and go into each other",
 }
 WAYS = {
     INDEFINITE: f". {MASSLESS}",

@@ -83,7 +83,7 @@ class Inputs(NamedTuple):
         require_number("sweep", "t0", t0, np.isfinite, "be finite")
         require_one_grid(stepper, duration, num_samples, times)
         if isinstance(dts, Adaptive):
-            require_controlled("sweep", stepper)
+            require_controlled("sweep", stepper, system)
             stepper = stepper.for_tolerance(dts.rtol)
             require_masses("sweep", system, "take steps without error control")
             size = _members(dts, dict(zip(NAMES, (stepper, q0, v0, params, z0), strict=True)), in_axes)

@@ -15,11 +15,11 @@ follows. When it happens is a function of both ends of the step tried first, wit
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
 from hhtjax.description import Array, PyTree
@@ -28,7 +28,7 @@ from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.coulomb import PROXIMAL, inverted
 from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.steppers.constrained import report_constraints
-from hhtjax.steppers.contact_instant import FINE, JAMMED, behind, touching
+from hhtjax.steppers.contact_instant import FINE, JAMMED, behind
 from hhtjax.steppers.contact_modes import ROUNDING, Course, Modes, Switch, asks, first_switch, matrix, presses, right_side
 from hhtjax.steppers.friction import each_row, equations_of, free_step
 from hhtjax.steppers.stepper import join_info
@@ -43,11 +43,6 @@ if TYPE_CHECKING:
 SWITCHES = 4, 2  # in a step, and for each contact
 CORRECTIONS = 2  # of the gap
 MANY = 2.0  # the code of a step, beside those of contact_instant.py
-
-
-def begin_contact(method, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
-    """The state at the start: who is closed, who sticks, and the accelerations of that."""
-    return touching(method, system, q, v, t, params, dt)
 
 
 def bind_contact(method, system: FlatSystem, params: PyTree, dt: Array):
@@ -94,7 +89,7 @@ def _in_parts(method, system: FlatSystem, params: PyTree, found: tuple, s: State
 def _go_on(method, system: FlatSystem, params: PyTree, way: Way, h: Array) -> Way:
     """The next part of a step h: to its end, or, if somebody switches before, a shorter one to be tried next."""
     s, aim = way.start, way.aim
-    short = h * np.sqrt(float(jnp.finfo(h.dtype).eps))
+    short = h * math.sqrt(float(jnp.finfo(h.dtype).eps))
     size = jnp.maximum(aim, short)
     s1, info, course = _part(method, system, params, moved(s, size / h), size)
     theta, switch = first_switch(course, Modes(s.contact.closed, s.contact.sig), system.contact.friction(params))

@@ -26,6 +26,7 @@ from hhtjax.steppers.stepper import ContactState, State
 from hhtjax.steppers.variable_step import drifted
 from hhtjax.systems.constraints import answers, curvature
 from hhtjax.systems.contact import directions, rates, rates_of_rates, speeds
+from hhtjax.systems.contact_start import nearly_closed
 from hhtjax.systems.friction import across
 
 if TYPE_CHECKING:
@@ -59,13 +60,13 @@ def _place(method, system: FlatSystem, q: Array, t: Array, params: PyTree) -> Pl
     return Place(answer, J, G, None if pulls[0] is None else jnp.stack(pulls), across(J, G))
 
 
-def touching(method, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, h: Array) -> State:
+def begin_contact(method, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, h: Array) -> State:
     """The state at a start: contacts that touch are closed, but for those that the accelerations take apart."""
     place, m = _place(method, system, q, t, params), system.contact.size
     w, _ = _free(system, place, q, v, t, params)
-    fast = speeds(place.J, v, w, h)
-    y = rates(system, q, v, t, params)
-    down = (jnp.abs(system.contact.gap(q, t, params)) <= NEAR * h * fast) & (jnp.abs(y[:m]) <= _still(fast))
+    fast, y = speeds(place.J, v, w, h), rates(system, q, v, t, params)
+    near = jnp.maximum(NEAR * h * fast, nearly_closed(q))
+    down = (jnp.abs(system.contact.gap(q, t, params)) <= near) & (jnp.abs(y[:m]) <= _still(fast))
     sig = jnp.where(jnp.abs(y[m:]) > _still(fast), jnp.sign(y[m:]), 0)
     zero = jnp.zeros_like(fast)
     s = State(t, q, v, w, w, contact=ContactState(jnp.zeros_like(y), zero, sig, zero - jnp.inf, zero))
@@ -84,6 +85,7 @@ def behind(method, system: FlatSystem, params: PyTree, before: tuple, switch: Sw
     closed = modes.closed > 0
     meets = (contact.gap(q, t, params) <= NEAR * h * fast) & (y[:m] < -_still(fast))
     hits = ~closed & ((switch.lands > 0) | meets)
+    counted = hits & (y[:m] < -_still(fast))
     here = closed | hits
     coupled = jnp.abs(place.K[:m, :m]) > COUPLED * jnp.abs(diagonal(place.K)[:m, None])
     others = coupled & here[None, :] & ~jnp.eye(m, dtype=bool)
@@ -103,12 +105,19 @@ def behind(method, system: FlatSystem, params: PyTree, before: tuple, switch: Sw
     v = _held(place, Modes(down.astype(v.dtype), slides).held(mu), v, y)
     # what would still bounce, infinitely often, rests behind all that
     zeno = jnp.where(flies & down, 2 * y[:m] / jnp.where(down & flies, falling * (1 - e), 1), 0)
-    known = s.contact._replace(
-        since=jnp.where(closed, s.contact.since, t + zeno), impacts=s.contact.impacts + hits.astype(h.dtype)
-    )
+    since, impacts = jnp.where(closed, s.contact.since, t + zeno), s.contact.impacts + counted.astype(h.dtype)
+    known = s.contact._replace(since=since, impacts=impacts)
     s, found = _anew(system, place, s._replace(v=v, contact=known), down, slides, params)
     code = jnp.maximum(code, jnp.where(several, SEVERAL, FINE))
     return s, late, jnp.maximum(code, found).astype(h.dtype)
+
+
+def jumped_contact(method, system: FlatSystem, s: State, params: PyTree, h: Array) -> State:
+    """The state where forces jump: contacts that are closed let go or break away at once, if they have to."""
+    place, m = _place(method, system, s.q, s.t, params), system.contact.size
+    along = rates(system, s.q, s.v, s.t, params)[m:]
+    slides = jnp.where(jnp.abs(along) > _still(speeds(place.J, s.v, s.w, h)), s.contact.sig, 0)
+    return _anew(system, place, s, s.contact.closed > 0, slides, params)[0]
 
 
 def _late(system: FlatSystem, params: PyTree, s: State, switch: Switch, h: Array) -> Array:

@@ -116,7 +116,7 @@ def asks(course: Course, modes: Modes, mu: Array):
 
 
 def first_switch(course: Course, modes: Modes, mu: Array):
-    """When the first contact switches, as a part of the step, infinite where none does; and the `Switch`."""
+    """When the first contact switches, as a part of the step, 1 where none does; and the `Switch`."""
     m = len(mu)
     lets, breaks, stops, lands = asks(course, modes, mu)
     f_N, f_T = ([f[part] for f in course.f] for part in (slice(m), slice(m, None)))
@@ -130,7 +130,7 @@ def first_switch(course: Course, modes: Modes, mu: Array):
     ]
     flat = jnp.concatenate(times)
     first = jnp.arange(4 * m) == jnp.argmin(lax.stop_gradient(flat))
-    theta = jnp.sum(jnp.where(first, flat, 0))
+    theta = jnp.sum(jnp.where(first & (flat < 1), flat, 0)) + jnp.where(jnp.any(flat < 1), 0, 1)
     now = [(t <= theta + TOGETHER) & (t < 1) for t in times]
     lets, breaks, stops, lands = (x.astype(mu.dtype) for x in now)
     return theta, Switch(lets, breaks * side, stops, lands)

@@ -17,7 +17,8 @@ from hhtjax.numerics.linear_solve import Structured, factorize_with
 from hhtjax.numerics.sparse_lu import SparseLU
 from hhtjax.numerics.structured_solve import Detected
 from hhtjax.steppers.constrained import begin_constrained, bind_constrained
-from hhtjax.steppers.contact import begin_contact, bind_contact
+from hhtjax.steppers.contact import bind_contact
+from hhtjax.steppers.contact_instant import begin_contact, jumped_contact
 from hhtjax.steppers.friction import begin_friction, bind_friction, smoothed_friction
 from hhtjax.steppers.implicit_solve import (
     factorized_once,
@@ -122,6 +123,8 @@ class GeneralizedAlpha(Controlled, Stepper):
         self, system: FlatSystem, before: State, after: State, old: PyTree, new: PyTree, dt: Array, answer: Callable
     ) -> State:
         """`after`, the state where held inputs jump; smooth, where what damps is too stiff for dt."""
+        if system.contact is not None:
+            return jumped_contact(self, self.seen(system, new, before.q.dtype), before, new, dt)
         if self.options.start == "simple" or not system.positions:
             return after
         system = self.seen(system, new, before.q.dtype)

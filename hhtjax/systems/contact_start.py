@@ -1,0 +1,68 @@
+"""Where contacts may start: apart, or closed and not about to be pressed together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.description import Array, PyTree, Real, known_now
+from hhtjax.numerics.dense_lu import matvec
+from hhtjax.systems.contact import directions, rates
+from hhtjax.systems.flat_system import flatten
+from hhtjax.xla import Programs
+
+if TYPE_CHECKING:
+    from hhtjax.systems.flat_system import FlatSystem
+
+CLOSED = 1e-9  # of the size of q, as which a gap is 0
+STILL = 1e-6  # of the velocities that a rate is made of, as which it is 0
+OVERLAPS, APPROACHES = 1, 2
+
+
+def require_contact_start(
+    caller: str, system, q0: PyTree, v0: PyTree, t0: Real, params: PyTree, z0: PyTree = None
+) -> None:
+    """An error for a start in which bodies overlap, or touch and go into each other; tracers pass."""
+    found = known_now(_start, system, q0, v0, t0, params, z0)
+    if found is None:
+        return
+    gap, rate, flaws = map(np.asarray, found)
+    flaws = flaws.reshape(-1, flaws.shape[-1]).max(axis=0)
+    for i in np.flatnonzero(flaws)[:1]:
+        g, speed = (x.reshape(-1, x.shape[-1])[:, i] for x in (gap, rate))
+        if flaws[i] == OVERLAPS:
+            raise ValueError(
+                f"{caller}: `q0` must keep bodies apart: the gap of contact {i} is {g.min():.6g}; expected 0 or more."
+            )
+        raise ValueError(
+            f"{caller}: `v0` must not press bodies together that touch: the gap of contact {i} is 0 and changes by "
+            f"{speed.min():.6g} a unit of time; expected 0 or more. Start before the impact, or behind it."
+        )
+
+
+@Programs
+def _start(system, q0: PyTree, v0: PyTree, t0: Array, params: PyTree, z0: PyTree):
+    """The gaps, their rates, and what is wrong with each."""
+    flat, q, v = flatten("simulate", system, q0, v0, t0, params, z0)
+    t = jnp.asarray(t0).astype(q.dtype)
+    m = flat.contact.size
+    return flat.contact.gap(q, t, params), rates(flat, q, v, t, params)[:m], start_flaws(flat, q, v, t, params)
+
+
+def start_flaws(flat: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) -> Array:
+    """(m,): what is wrong with the start of each contact, 0 nothing."""
+    assert flat.contact is not None
+    m = flat.contact.size
+    gap, y = flat.contact.gap(q, t, params), rates(flat, q, v, t, params)[:m]
+    zero = nearly_closed(q)
+    fast = matvec(jnp.abs(directions(flat, q, t, params)[:m]), jnp.abs(v))
+    still = max(STILL, 1e3 * float(jnp.finfo(v.dtype).eps)) * fast
+    approaches = (gap <= zero) & (y < -still)
+    return jnp.where(gap < -zero, OVERLAPS, jnp.where(approaches, APPROACHES, 0))
+
+
+def nearly_closed(q: Array) -> Array:
+    """The gap that counts as 0 at a start."""
+    return max(CLOSED, 1e3 * float(jnp.finfo(q.dtype).eps)) * (1 + jnp.max(jnp.abs(q)))
