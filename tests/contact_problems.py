@@ -26,14 +26,24 @@ def ball() -> Scene:
     )
 
     def force(q, v, t, params):
-        return jnp.array([0.0, -GRAVITY]) - params["c"] * v
+        return jnp.array([0.0, -GRAVITY], q.dtype) - params["c"] * v
 
     system = hhtjax.System(jnp.ones(2), force, contact=floor)
     return Scene(system, jnp.array([0.0, 1.0]), jnp.array([2.0, 0.0]), {"e": 0.6, "c": 0.3, "mu": 0.1}, 3.0)
 
 
+def slope() -> Scene:
+    """A block on a slope of 0.3 rad, at rest: it stays for mu > tan 0.3."""
+    on = hhtjax.Contact(lambda q, t, params: q[1], lambda q, v, t, params: v[0], "mu")
+
+    def force(q, v, t, params):
+        return GRAVITY * jnp.array([jnp.sin(0.3), -jnp.cos(0.3)])
+
+    return Scene(hhtjax.System(jnp.ones(2), force, contact=on), jnp.zeros(2), jnp.zeros(2), {"mu": 0.2}, 1.0)
+
+
 def table(amplitude: float = 0.05, frequency: float = 12.0) -> Scene:
-    """A mass on a table that moves to and fro below it, pulled by a spring, with a changing load: it sticks and slips."""
+    """A mass on a table that moves to and fro, pulled by a spring, with a changing load: it sticks and slips."""
     speed = amplitude * frequency
     on = hhtjax.Contact(
         gap=lambda q, t, params: q[1],
@@ -78,25 +88,66 @@ def stack(amplitude: float, frequency: float = 8.0) -> Scene:
     return Scene(system, q0, v0, {"mu": 0.5}, 2.0)
 
 
-def block() -> Scene:
-    """A block, 1 m wide and 2 m high, that stands tilted on a corner, falls, and rocks: two corners touch the floor."""
-    b, h = 0.5, 1.0
+def standing(points, inertia: float, q0: Any, v0: Any, params: dict, T: float, restitution: Any = 0.0) -> Scene:
+    """A body of 1 kg, of which points (x, y) beside its centre can touch a floor; q = (x, y, angle)."""
 
-    def corner(q, side):
+    def places(q):
         s, c = jnp.sin(q[2]), jnp.cos(q[2])
-        return jnp.stack([c * side * b + s * h, s * side * b - c * h])  # from the centre, in space
+        return [jnp.stack([c * x - s * y, s * x + c * y]) for x, y in points]
 
     def gap(q, t, params):
-        return jnp.stack([q[1] + corner(q, side)[1] for side in (-1, 1)])
+        return jnp.stack([q[1] + r[1] for r in places(q)])
 
     def sliding(q, v, t, params):
-        return jnp.stack([v[0] - v[2] * corner(q, side)[1] for side in (-1, 1)])
+        return jnp.stack([v[0] - v[2] * r[1] for r in places(q)])
 
     def force(q, v, t, params):
         return jnp.array([0.0, -GRAVITY, 0.0])
 
-    tilt = 0.2
-    on_corner = hhtjax.Contact(gap, sliding, "mu")
-    system = hhtjax.System(jnp.array([1.0, 1.0, (b**2 + h**2) / 3]), force, contact=on_corner)
+    contact = hhtjax.Contact(gap, sliding, "mu", restitution)
+    return Scene(hhtjax.System(jnp.array([1.0, 1.0, inertia]), force, contact=contact), q0, v0, params, T)
+
+
+def block() -> Scene:
+    """A block, 1 m wide and 2 m high, that stands tilted on a corner, falls, and rocks: two corners touch the floor."""
+    b, h, tilt = 0.5, 1.0, 0.2
     height = jnp.sin(tilt) * b + jnp.cos(tilt) * h
-    return Scene(system, jnp.array([0.0, height, tilt]), jnp.zeros(3), {"mu": 0.8}, 3.0)
+    start = jnp.array([0.0, height, tilt]), jnp.zeros(3)
+    return standing([(-b, -h), (b, -h)], (b**2 + h**2) / 3, *start, {"mu": 0.8}, 3.0)
+
+
+def rod(angle: float = 1.0, mu: float = 0.4) -> Scene:
+    """A rod of 1 m, one end of which stands on the floor: it slides, and falls down flat."""
+    start = jnp.array([0.0, jnp.sin(angle) / 2, angle]), jnp.array([0.3, 0.0, 0.0])
+    return standing([(-0.5, 0.0), (0.5, 0.0)], 1 / 12, *start, {"mu": mu}, 1.0)
+
+
+def hopper() -> Scene:
+    """Two masses above each other, and a driven spring between: the lower one leaves the floor, and lands."""
+    upper, lower, k, c, length = 1.0, 0.5, 400.0, 4.0, 0.5
+
+    def force(q, v, t, params):
+        drive, rate = 0.06 * jnp.sin(14 * t), 0.06 * 14 * jnp.cos(14 * t)
+        push = k * (length + drive - (q[0] - q[1])) - c * (v[0] - v[1] - rate)
+        return jnp.stack([push - upper * GRAVITY, -push - lower * GRAVITY])
+
+    floor = hhtjax.Contact(lambda q, t, params: q[1], restitution="e")
+    system = hhtjax.System(jnp.array([upper, lower]), force, contact=floor)
+    return Scene(system, jnp.array([length - upper * GRAVITY / k, 0.0]), jnp.zeros(2), {"e": 0.0}, 0.8)
+
+
+def bowl() -> Scene:
+    """A block that slides in a bowl y = x^2 - x^4/8, to and fro, until friction holds it beside the lowest point."""
+
+    def gap(q, t, params):
+        return q[1] - q[0] ** 2 + q[0] ** 4 / 8
+
+    def sliding(q, v, t, params):
+        slope = 2 * q[0] - q[0] ** 3 / 2
+        return (v[0] + slope * v[1]) / jnp.sqrt(1 + slope**2)
+
+    def force(q, v, t, params):
+        return jnp.array([0.0, -GRAVITY])
+
+    system = hhtjax.System(jnp.ones(2), force, contact=hhtjax.Contact(gap, sliding, "mu"))
+    return Scene(system, jnp.array([0.9, 0.9**2 - 0.9**4 / 8]), jnp.zeros(2), {"mu": 0.35}, 2.0)

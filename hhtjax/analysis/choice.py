@@ -137,7 +137,7 @@ def choose_stepper(
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; a q that does not move; a tolerance that no method
             reaches, with what each of them did; JAX in single precision; called inside of jit, vmap or grad.
-        NotImplementedError: coordinates without mass.
+        NotImplementedError: coordinates without mass; contact.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> pendulum = hhtjax.System(jnp.ones(1), lambda q, v, t, c: -9.81 * jnp.sin(q) - c * v)
@@ -152,6 +152,8 @@ def choose_stepper(
     rodas5p()
     """
     caller = "choose_stepper"
+    if getattr(system, "contact", None) is not None:
+        raise NotImplementedError(f"{caller}: with contact take hht(), and halve dt until the motion stays the same.")
     params = _require(caller, system, params, (q0, v0, z0), duration, tolerance, num_samples, t0)
     tolerance, told = float(tolerance), []
     start = initial_values(caller, system, q0, v0, z0)

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from hhtjax.checks import require_function
-from hhtjax.description import Array, PyTree, current, freeze, thaw
+from hhtjax.checks import require_function, require_number
+from hhtjax.description import Array, PyTree, Real, current, freeze, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.numerics.dense_lu import matvec
 from hhtjax.runs.interpolate import interpolate, on_axes
 from hhtjax.runs.output import require_path
-from hhtjax.runs.solution import Solution
+from hhtjax.runs.solution import SimulationError, Solution
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.constraints import answers
 from hhtjax.systems.flat_system import flatten
@@ -44,6 +45,31 @@ class EnergyBalance(NamedTuple):
     potential: Array
     work: Array
     error: Any
+
+    def check(self, part: Real = 0.5):
+        """Raises `SimulationError` where energy has come from nowhere: `error` is more than this part of the largest
+        kinetic energy so far. So it is where a stiff spring stands for contact and the steps are too long for it: the
+        motion stays finite, and `Solution.check` sees nothing.
+
+        Not to be called inside jit. Of a batch the first bad member is told.
+
+        >>> import jax.numpy as jnp, hhtjax
+        >>> wall = hhtjax.System(jnp.ones(1), lambda q, v, t, params: jnp.where(q < 0, -1e7 * q, 0 * q) - 9.81)
+        >>> run = hhtjax.simulate(wall, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.01, num_steps=100)
+        >>> hhtjax.analysis.energy_balance(wall, run).check()                           # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        hhtjax.runs.solution.SimulationError: energy_balance: by t = 0.46 the method has made ... J ...
+        """
+        require_number("check", "part", part, lambda x: x > 0, "be positive")
+        kinetic, error, t = map(np.asarray, (self.kinetic, self.error, self.t))
+        most = np.maximum.accumulate(kinetic, axis=-1)
+        bad = ~(error <= part * most) & (error != 0)
+        for member in np.argwhere(bad)[:1]:
+            i, of = tuple(member), f" of member {tuple(map(int, member[:-1]))}" if len(member) > 1 else ""
+            raise SimulationError(
+                f"energy_balance: by t = {t[i]:g} the method has made {error[i]:.3g} J{of}, of at most {most[i]:.3g} J "
+                "of kinetic energy: dt does not resolve some stiff force. Take a smaller one; where bodies meet, Contact."
+            )
 
 
 def energy_balance(
@@ -74,6 +100,7 @@ def energy_balance(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind.
+        NotImplementedError: a system with contact.
 
     Example: a damped spring, started with 2 J, after 1 s: both energies, what the damper took, what HHT made.
 
@@ -90,6 +117,8 @@ def energy_balance(
     if not isinstance(solution, Solution) or solution.t.ndim != 1:
         raise ValueError(f"{caller}: `solution` must be of one run (vmap over a batch); received {solution!r}.")
     require_path(caller, solution)
+    if system.contact is not None:
+        raise NotImplementedError(f"{caller}: `system` has contact, whose friction and impacts it does not balance.")
     if potential is not None:
         require_function(caller, "potential", potential, "potential(q, t, params)")
         potential = current(potential)

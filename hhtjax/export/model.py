@@ -165,6 +165,8 @@ def given(
     require_capable(caller, system, stepper, q0, v0)
     params = require_params(caller, params)
     require_dense(caller, system, params)
+    if system.contact is not None:
+        raise NotImplementedError(f"{caller}: `system` has contact, which is not written out: leave `contact` out.")
     if system.friction is not None:
         system = with_known_rows(caller, system, q0, v0, 0.0, params, z0)
     if not all_concrete((system, stepper, q0, v0, params, z0)):

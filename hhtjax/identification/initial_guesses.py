@@ -71,7 +71,7 @@ def equation_error(
     Raises:
         TypeError, ValueError: what is no system; as `band_limited_motion` and `sampled`; no samples between the ends;
             nothing that slides.
-        NotImplementedError: a system with constraints or internal states; when called, with rotations.
+        NotImplementedError: a system with constraints, internal states or contact; when called, with rotations.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)
@@ -86,6 +86,8 @@ def equation_error(
         raise NotImplementedError("equation_error: `system` has a constraint, whose forces are not measured.")
     if system.internal is not None:
         raise NotImplementedError("equation_error: `system` has internal states, which are not measured.")
+    if system.contact is not None:
+        raise NotImplementedError("equation_error: `system` has contact, whose forces are not measured.")
     if times is not None:
         values, dt, t0 = _at_equal_distances(values, dt, t0, times)
     motion = jax.tree.map(lambda y: band_limited_motion(y, dt, cutoff), values)

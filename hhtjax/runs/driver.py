@@ -20,7 +20,7 @@ from hhtjax.numerics.batched_cond import if_any, tree_where
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.primitives import in_turn
 from hhtjax.runs.event_step import EventContext, EventState, Pieces, SubStep, asks, pass_events, reaching, unnoted
-from hhtjax.runs.solution import FINE, INTERNAL_STATE, APART, ContactForces, Failure, Log, Solution
+from hhtjax.runs.solution import APART, FINE, INTERNAL_STATE, ContactForces, Failure, Log, Solution
 from hhtjax.steppers.friction_switching import is_settled
 from hhtjax.steppers.stepper import Info, bound, entered, join_info, public, step_start
 from hhtjax.steppers.variable_step import resized_step

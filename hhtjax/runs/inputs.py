@@ -31,8 +31,8 @@ from hhtjax.runs.event_step import nearness
 from hhtjax.steppers.stepper import require_capable, require_stepper, require_system
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.affine import require_affine
-from hhtjax.systems.events import Event, Impact, flatten_events, require_times
 from hhtjax.systems.contact_start import require_contact_start
+from hhtjax.systems.events import Event, Impact, flatten_events, require_times
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.held_nodes import require_held_start
 from hhtjax.systems.initial_conditions import initial_values, require_consistent, with_known_rows

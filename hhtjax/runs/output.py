@@ -14,7 +14,7 @@ import numpy as np
 from hhtjax.checks import check_dtype, describe, require_function
 from hhtjax.description import Array, Description, PyTree, is_array, thaw
 from hhtjax.runs.driver import as_solution
-from hhtjax.runs.solution import Solution
+from hhtjax.runs.solution import ContactForces, Solution
 from hhtjax.steppers.stepper import public
 from hhtjax.systems import zero_order_hold
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from hhtjax.steppers.stepper import Info, State
     from hhtjax.systems.flat_system import FlatSystem
 
-NAMES = ("q", "v", "w", "L", "z", "zdot", "friction", "sticking", "t", "params")
-SIGNATURE = "of some of q, v, w, L, z, zdot, friction, sticking, t and params, by these names"
+NAMES = ("q", "v", "w", "L", "z", "zdot", "friction", "sticking", "contact", "t", "params")
+SIGNATURE = "of some of q, v, w, L, z, zdot, friction, sticking, contact, t and params, by these names"
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ def output_of(output: Output, flat, params: PyTree, state) -> PyTree:
     """What `output` gives at a state on vectors."""
     state = public(flat, state)
     values = {"t": state.t, "params": params, "L": state.L, "w": None, "z": None, "zdot": None}
-    values |= {"friction": None, "sticking": None}
+    values |= {"friction": None, "sticking": None, "contact": None}
     values |= {"q": flat.unravel(state.q), "v": flat.unravel_rates(state.v)}
     if state.w is not None:
         values["w"] = flat.unravel_rates(state.w)
@@ -106,6 +106,8 @@ def output_of(output: Output, flat, params: PyTree, state) -> PyTree:
         values |= {"z": flat.unravel_internal(state.z), "zdot": flat.unravel_internal(state.zdot)}
     if state.friction is not None:
         values |= {"friction": state.friction.tau, "sticking": state.friction.sig == 0}
+    if state.contact is not None:
+        values["contact"] = ContactForces.of(state.contact)
     return output(values, state.t.dtype)
 
 

@@ -38,6 +38,8 @@ from hhtjax.runs.inputs import (
 from hhtjax.runs.output import require_output, savings
 from hhtjax.runs.progress import announce, draw, in_blocks, steps_between
 from hhtjax.runs.solution import Solution, told
+from hhtjax.runs.sweep import run_member
+from hhtjax.runs.sweep_inputs import fit_to_times
 from hhtjax.steppers.implicit_solve import callbacks_named
 from hhtjax.steppers.stepper import Stepper, join_info
 from hhtjax.steppers.variable_step import GROWTH
@@ -165,6 +167,11 @@ def simulate(
     problem = Problem.checked("simulate", system, stepper, q0, v0, params, t0, z0)
     problem = problem._replace(output=require_output("simulate", output))
     save_every = require_integer("simulate", "save_every", save_every)
+    if system.contact is not None and extrapolate != 1:
+        raise NotImplementedError(
+            "simulate: leave `extrapolate` out with contact: steps within which it switches have no error in powers of "
+            f"dt; received {extrapolate!r}."
+        )
     if not isinstance(extrapolate, int) or isinstance(extrapolate, bool) or not 1 <= extrapolate <= MOST:
         raise ValueError(f"simulate: `extrapolate` must be an integer from 1 to {MOST}; received {extrapolate!r}.")
     room = (
@@ -196,9 +203,11 @@ def simulate(
             events = require_events("simulate", problem, events, dt)
         warn_of_jumps_to(problem, dt, times)
 
+        read_off = _read_off if system.contact is None else _land
+
         def run_to(k: int) -> Solution:
             with callbacks_named():
-                return _read_off(problem, times, dt / k, events, room=room, rates=kind["rates"])
+                return read_off(problem, times, dt / k, events, room=room, rates=kind["rates"])
 
         solution = run_to(1) if extrapolate == 1 else extrapolated(run_to, extrapolate, stepper.order, join_info)
         return told("simulate", solution, throw)
@@ -236,6 +245,19 @@ def _read_off(problem: Problem, times: Array, dt: Array, events, *, room: tuple)
         return follow(problem, times, EqualSteps.to(t0, times, dt), events, room)._replace(dt=dt)
 
     return one_kernel(run, problem, times, dt, events, around=True)  # what comes before and behind the loop too
+
+
+@partial(Programs, static_argnames=("room",))
+def _land(problem: Problem, times: Array, dt: Array, events, *, room: tuple) -> Solution:
+    """The run with steps that end at the times, and are no longer than dt: between those of a contact that meets,
+    sticks or lets go there are kinks."""
+    t0, times, dt = map(problem.times, (problem.t0, times, dt))
+    grid = jnp.concatenate([t0[None], times])
+    substeps, sizes = (x[0] for x in fit_to_times(dt[None], grid))
+    data = problem.stepper, problem.q0, problem.v0, problem.params, problem.z0
+    steps = sizes, substeps, substeps, t0, len(times), grid
+    run = run_member(problem.system, data, *steps, events, room, problem.output, grows=True, caller="simulate")
+    return run._replace(dt=dt)
 
 
 @partial(Programs, static_argnames=("num_steps", "save_every", "progress", "room", "grows", "in_batch"))

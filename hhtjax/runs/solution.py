@@ -41,8 +41,8 @@ class ContactForces(NamedTuple):
         closed: (K + 1, m), whether bodies touch.
         sticking: (K + 1, m), whether they also stick.
         impacts: (K + 1, m), how many impacts there have been.
-        rests_since: (m,), since when a contact that is closed in the end has been so, s; -inf: from the start on;
-            inf: it is open. Of one that bounced, the time at which infinitely many bounces would have ended.
+        rests_since: (K + 1, m), since when a closed contact has been so, s; -inf: from the start on; inf: it is open.
+            Of one that bounced, the time at which infinitely many bounces would have ended.
     """
 
     normal: Array
@@ -57,7 +57,7 @@ class ContactForces(NamedTuple):
         """Those of a state of a step."""
         m = contact.closed.shape[-1]
         closed = contact.closed > 0
-        since = jnp.where(closed, contact.since, jnp.inf)[-1]
+        since = jnp.where(closed, contact.since, jnp.inf)
         forces = contact.f[..., :m], contact.f[..., m:]
         return cls(*forces, closed, closed & (contact.sig == 0), contact.impacts.astype(jnp.int32), since)
 
@@ -109,6 +109,8 @@ class Failure(NamedTuple):
             return "the linear solve left too much"
         if known(self.friction):
             return "the dry friction was not found"
+        if contact := known(self.contact):
+            return CONTACT[int(contact)].split(". ")[0]
         row = known(self.row)
         if row is not None and row >= 0:
             return "a constraint depends on others"

@@ -248,6 +248,7 @@ def run_member(
     room: tuple,
     output: Output | None = None,
     grows: bool = False,
+    caller: str = "sweep",
 ) -> Solution:
     """One member; it rests from `substeps` to `longest`, where its block still works.
 
@@ -258,7 +259,7 @@ def run_member(
     problem = Problem(system, stepper, q0, v0, params, t0, z0, output)
     steps = partial(equal_steps, dt=dt if times is None else dt[0])
     intervals = dt, substeps, longest, num_samples, times
-    return drive(problem, steps, partial(_at_ends, intervals=intervals, grows=grows), events, room, caller="sweep")
+    return drive(problem, steps, partial(_at_ends, intervals=intervals, grows=grows), events, room, caller=caller)
 
 
 def _at_ends(run: Run, intervals: tuple, grows: bool):

@@ -1,4 +1,4 @@
-"""The generalised-alpha step with contacts: those that are closed are modes of it, and it is divided where one switches.
+"""The generalised-alpha step with contacts: closed ones are modes of it, and it is divided where one switches.
 
 The residual holds the contact forces f0 of the start of the step; what they change by is answered linearly,
 
@@ -29,7 +29,17 @@ from hhtjax.numerics.coulomb import PROXIMAL, inverted
 from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.steppers.constrained import report_constraints
 from hhtjax.steppers.contact_instant import FINE, JAMMED, behind
-from hhtjax.steppers.contact_modes import ROUNDING, Course, Modes, Switch, asks, first_switch, matrix, presses, right_side
+from hhtjax.steppers.contact_modes import (
+    ROUNDING,
+    Course,
+    Modes,
+    Switch,
+    asks,
+    first_switch,
+    matrix,
+    presses,
+    right_side,
+)
 from hhtjax.steppers.friction import each_row, equations_of, free_step
 from hhtjax.steppers.stepper import join_info
 from hhtjax.steppers.variable_step import drifted, moved
@@ -96,10 +106,7 @@ def _go_on(method, system: FlatSystem, params: PyTree, way: Way, h: Array) -> Wa
     s1 = tree_where(aim <= short, drifted(system, s, aim), s1)
     switches = way.switch.any()
     fails = ~switches & (theta < 1) & (aim > short)
-    s2, late, code = call_where(
-        partial(behind, method, system, params), switches, (s1, jnp.zeros_like(h), info.contact), way.switch, h
-    )
-    info = info._replace(contact=jnp.maximum(info.contact, code))
+    s2, late = call_where(partial(behind, method, system, params), switches, (s1, jnp.zeros_like(h)), way.switch, h)
     start = tree_where(switches, s2, s)
     rest = jnp.where(switches, way.rest - aim - late, way.rest)
     aim = jnp.where(fails, theta * aim, rest)
@@ -150,13 +157,13 @@ def _part(method, system: FlatSystem, params: PyTree, s: State, h: Array):
     a = s1.a - matvec(Gv, change(jnp.where(held, matvec(J, s1.a - w), 0)))
     f1 = f0 + df + more
     L = None if s1.L is None else s1.L + matvec(answers[:, size : size + n].T, more)
-    s1 = system.tidy(s1._replace(q=q, v=v, w=w, a=a, L=L, contact=s.contact._replace(f=f1)))
+    s1 = system.tidy(s1._replace(q=q, v=v, w=w, a=a, L=L, contact=s.contact._replace(f=f1, code=jnp.zeros_like(h))))
 
     gaps = tuple(jnp.where(closed, 0, gap(x.q, x.t)) for x in (s, s1))
     ends = tuple(jnp.where(held, 0, x) for x in (y(s.q, s.v, s.t), y1))
     course = Course(h, gaps, ends, (f0, f1), _roundings(s1, J, f1))
     jams = jnp.any(closed & (presses(K, modes, mu) <= PROXIMAL * jnp.abs(diagonal(K)[:m])))
-    info = info._replace(contact=jnp.where(jams, JAMMED, FINE).astype(h.dtype))
+    info = info._replace(contact=jnp.maximum(s.contact.code, jnp.where(jams, JAMMED, FINE).astype(h.dtype)))
     return s1, info if B is None else report_constraints(method, system, params, h, s, s1, info, B), course
 
 

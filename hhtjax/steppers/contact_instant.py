@@ -69,13 +69,15 @@ def begin_contact(method, system: FlatSystem, q: Array, v: Array, t: Array, para
     down = (jnp.abs(system.contact.gap(q, t, params)) <= near) & (jnp.abs(y[:m]) <= _still(fast))
     sig = jnp.where(jnp.abs(y[m:]) > _still(fast), jnp.sign(y[m:]), 0)
     zero = jnp.zeros_like(fast)
-    s = State(t, q, v, w, w, contact=ContactState(jnp.zeros_like(y), zero, sig, zero - jnp.inf, zero))
-    return _anew(system, place, s, down, sig, params)[0]
+    s = State(
+        t, q, v, w, w, contact=ContactState(jnp.zeros_like(y), zero, sig, zero - jnp.inf, zero, jnp.zeros_like(t))
+    )
+    return _anew(system, place, s, down, sig, params)
 
 
 def behind(method, system: FlatSystem, params: PyTree, before: tuple, switch: Switch, h: Array):
-    """The state behind a switch, by how much later that is than the state before, and the code. h: the whole step."""
-    s, _, code = before
+    """The state behind a switch, and by how much later that is than the state before. h: the whole step."""
+    s, _ = before
     contact, m = system.contact, system.contact.size
     late = _late(system, params, s, switch, h)
     s = drifted(system, s, late)
@@ -106,10 +108,9 @@ def behind(method, system: FlatSystem, params: PyTree, before: tuple, switch: Sw
     # what would still bounce, infinitely often, rests behind all that
     zeno = jnp.where(flies & down, 2 * y[:m] / jnp.where(down & flies, falling * (1 - e), 1), 0)
     since, impacts = jnp.where(closed, s.contact.since, t + zeno), s.contact.impacts + counted.astype(h.dtype)
-    known = s.contact._replace(since=since, impacts=impacts)
-    s, found = _anew(system, place, s._replace(v=v, contact=known), down, slides, params)
-    code = jnp.maximum(code, jnp.where(several, SEVERAL, FINE))
-    return s, late, jnp.maximum(code, found).astype(h.dtype)
+    code = jnp.where(several, SEVERAL, FINE).astype(h.dtype)
+    known = s.contact._replace(since=since, impacts=impacts, code=code)
+    return _anew(system, place, s._replace(v=v, contact=known), down, slides, params), late
 
 
 def jumped_contact(method, system: FlatSystem, s: State, params: PyTree, h: Array) -> State:
@@ -117,7 +118,7 @@ def jumped_contact(method, system: FlatSystem, s: State, params: PyTree, h: Arra
     place, m = _place(method, system, s.q, s.t, params), system.contact.size
     along = rates(system, s.q, s.v, s.t, params)[m:]
     slides = jnp.where(jnp.abs(along) > _still(speeds(place.J, s.v, s.w, h)), s.contact.sig, 0)
-    return _anew(system, place, s, s.contact.closed > 0, slides, params)[0]
+    return _anew(system, place, s, s.contact.closed > 0, slides, params)
 
 
 def _late(system: FlatSystem, params: PyTree, s: State, switch: Switch, h: Array) -> Array:
@@ -141,8 +142,8 @@ def _held(place: Place, held: Array, v: Array, y: Array) -> Array:
 
 
 def _anew(system: FlatSystem, place: Place, s: State, down: Array, sig: Array, params: PyTree):
-    """The state with the modes, forces and accelerations of contacts that are down, and the code. sig: the directions
-    in which they slide, 0 of those that do not."""
+    """The state with the modes, forces and accelerations of contacts that are down. sig: the directions in which they
+    slide, 0 of those that do not."""
     q, v, t, mu = s.q, s.v, s.t, system.contact.friction(params)
     w, L = _free(system, place, q, v, t, params)
     ydot = rates_of_rates(system, q, v, w, t, params)
@@ -151,9 +152,11 @@ def _anew(system: FlatSystem, place: Place, s: State, down: Array, sig: Array, p
     f = inverted(matrix(place.K, modes, mu))(right_side(ydot, jnp.zeros_like(ydot), modes, mu))
     w = w + matvec(place.G.T, f)
     L = None if L is None else L + matvec(place.pulls.T, f)
-    known = s.contact._replace(f=f, closed=modes.closed, sig=modes.sig)
     code = jnp.where(found.jams, JAMMED, jnp.where(found.found, FINE, NO_FORCES)).astype(v.dtype)
-    return s._replace(v=v, w=w, a=w, L=L, contact=known), code
+    code = jnp.maximum(s.contact.code, code)
+    return s._replace(
+        v=v, w=w, a=w, L=L, contact=s.contact._replace(f=f, closed=modes.closed, sig=modes.sig, code=code)
+    )
 
 
 def _free(system: FlatSystem, place: Place, q: Array, v: Array, t: Array, params: PyTree):

@@ -1,4 +1,4 @@
-"""Modes of contacts: who is closed, who sticks, who slides where to; and when, within a step, the first of them switches.
+"""Modes of contacts: who is closed, who sticks, who slides where to; and when in a step the first of them switches.
 
 With modes the forces f = (f_N, f_T) answer to rates y = (dg/dt, s), or to their derivatives, linearly,
 
@@ -95,15 +95,15 @@ class Course(NamedTuple):
     rounding."""
 
     h: Array
-    gap: tuple
-    y: tuple
-    f: tuple
-    rounding: tuple
+    gap: tuple[Array, Array]
+    y: tuple[Array, Array]
+    f: tuple[Array, Array]
+    rounding: tuple[Array, Array, Array]
 
 
 def asks(course: Course, modes: Modes, mu: Array):
-    """Who cannot stay as it is to the end of the step: lets go, breaks away, stops, lands (m,). Of those whose gap turns
-    around, the last may yet be wrong."""
+    """Who cannot stay as it is to the end of the step: lets go, breaks away, stops, lands (m,). Where the gap turns
+    around in between, the last may yet be wrong."""
     m = len(mu)
     closed, stuck, slides = modes.which(mu)
     of_gap, of_rate, of_force = course.rounding
@@ -119,13 +119,12 @@ def first_switch(course: Course, modes: Modes, mu: Array):
     """When the first contact switches, as a part of the step, 1 where none does; and the `Switch`."""
     m = len(mu)
     lets, breaks, stops, lands = asks(course, modes, mu)
-    f_N, f_T = ([f[part] for f in course.f] for part in (slice(m), slice(m, None)))
-    side = jnp.sign(f_T[1])
-    left = [mu * N - side * T for N, T in zip(f_N, f_T, strict=True)]
+    f0, f1 = course.f
+    side = jnp.sign(f1[m:])
     times = [
-        _on_line(*f_N, lets),
-        _on_line(*left, breaks),
-        _on_line(*(modes.sig * y[m:] for y in course.y), stops),
+        _on_line(f0[:m], f1[:m], lets),
+        _on_line(mu * f0[:m] - side * f0[m:], mu * f1[:m] - side * f1[m:], breaks),
+        _on_line(modes.sig * course.y[0][m:], modes.sig * course.y[1][m:], stops),
         _on_cubic(course, lands),
     ]
     flat = jnp.concatenate(times)

@@ -173,10 +173,10 @@ class GeneralizedAlpha(Controlled, Stepper):
         """The system with these params, and with the sparse solve that the options, or its elements, ask for."""
         system, given = system.settled(params), self.options.solve
         if isinstance(given, Detected):
-            if system.friction is not None or system.linear or self.redundant is not None:
+            if system.friction is not None or system.contact or system.linear or self.redundant is not None:
                 raise NotImplementedError(
-                    "hht: leave out `solve` with dry friction, a LinearSystem (whose matrices may be sparse) or "
-                    f"redundant constraints; received {given!r}."
+                    "hht: leave out `solve` with dry friction, contact, a LinearSystem (whose matrices may be sparse) "
+                    f"or redundant constraints; received {given!r}."
                 )
             if system.sparse is not None and system.sparse.tolerance == given.tolerance and given.pattern is None:
                 return system

@@ -64,6 +64,7 @@ class ContactState(NamedTuple):
         sig: (m,), the direction in which a closed contact slides: -1, 1, or 0 where it sticks.
         since: (m,), since when a closed contact is that, -inf from the start on.
         impacts: (m,), how often bodies have met there.
+        code: 0, or what went wrong where the modes were chosen, for the next step to tell.
     """
 
     f: Array
@@ -71,6 +72,7 @@ class ContactState(NamedTuple):
     sig: Array
     since: Array
     impacts: Array
+    code: Array
 
 
 @shown

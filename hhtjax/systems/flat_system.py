@@ -297,7 +297,12 @@ def _with_elements(
             f"{LARGEST_WITH_FRICTION} unknowns; received {unknowns}. Write smooth friction into the elements, or take "
             "fewer of them."
         )
-    if unknowns > LOOPED and system.friction is None:
+    if system.contact is not None and unknowns > LARGEST_WITH_FRICTION:
+        raise NotImplementedError(
+            f"{caller}: `contact` in a system of elements is solved with full matrices, up to {LARGEST_WITH_FRICTION} "
+            f"unknowns; received {unknowns}. Take fewer of them."
+        )
+    if unknowns > LOOPED and system.friction is None and system.contact is None:
         matrix = cache(lambda: StepMatrix(force, flat, like[1], sparsity().plan(flat.size)))
         flat = flat._replace(sparse=SparseLU(sparsity), step_elements=lambda params: lambda *at: matrix()(params, *at))
     else:

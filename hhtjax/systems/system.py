@@ -408,7 +408,11 @@ def require_masses(caller: str, system: AnySystem, without: str):
 
 
 def require_smooth(caller: str, system):
-    """An error for dry friction, which is no function of the state."""
+    """An error for dry friction and contact, whose forces are no functions of the state."""
+    if system.contact is not None:
+        raise NotImplementedError(
+            f"{caller}: `system` has contact, whose forces are no functions of q and v: leave `contact` out."
+        )
     if system.friction is not None:
         raise NotImplementedError(
             f"{caller}: `system` has dry friction, which is no function of q and v: leave `friction` out, or put a "
