@@ -68,7 +68,7 @@ class EnergyBalance(NamedTuple):
             i, of = tuple(member), f" of member {tuple(map(int, member[:-1]))}" if len(member) > 1 else ""
             raise SimulationError(
                 f"energy_balance: by t = {t[i]:g} the method has made {error[i]:.3g} J{of}, of at most {most[i]:.3g} J "
-                "of kinetic energy: dt does not resolve some stiff force. Take a smaller one; where bodies meet, Contact."
+                "of kinetic energy: dt does not resolve a stiff force. Take a smaller one; where bodies meet, Contact."
             )
 
 

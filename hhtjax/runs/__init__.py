@@ -138,7 +138,7 @@ Outputs
 
 `output=` saves a function of the motion in the place of q and v, in `simulate`, `sweep` and `sweep_to_disk`: what
 sensors show, energies, a distance. It names what it reads, of q, v, w (the acceleration), L (multipliers), z, zdot,
-friction, sticking, t and params. A run of a million steps of a large system then keeps what is asked for.
+friction, sticking, contact, t and params. A run of a million steps of a large system then keeps what is asked for.
 
 >>> def felt(q, w, params):
 ...     return {"height": -params["l"] * jnp.cos(q[0]), "turning": w[0]}
@@ -231,10 +231,11 @@ or a function of params, divides steps there, and error control ends them there.
 >>> [round(float(f(0.27)), 6) for f in (where, jax.grad(where))]              # 1 - .4 (1 - .27)^2, .8 (1 - .27)
 [0.78684, 0.584]
 
-Contact that lasts is a constraint that events switch on and off: on where the body meets its stop, with `impact(0.0)`,
-off where the multiplier falls to zero, which a guard sees that has an argument `multipliers`. The number of constraints
-of a run is fixed, so one that is off holds a coordinate of its own instead: `hhtjax.scenes.shaken_table` shows it. A
-body may start at rest at its guard where its acceleration takes it off.
+Contact that lasts is a `Contact` of the system (`hhtjax.systems`). In three dimensions, without friction, it can be a
+constraint that events switch on and off: on where the body meets its stop, with `impact(0.0)`, off where the multiplier
+falls to zero, which a guard sees that has an argument `multipliers`. The number of constraints of a run is fixed, so
+one that is off holds a coordinate of its own instead: `hhtjax.scenes.shaken_table` shows it. A body may start at rest
+at its guard where its acceleration takes it off.
 
 What fails is named, and never ends behind the wall: more changes in a step than `max_events`, as of a ball that comes
 to rest; a motion that stays beyond its guard; two impacts at one time; a start beyond a guard. Derivatives belong to

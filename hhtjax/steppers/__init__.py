@@ -35,7 +35,8 @@ stepper                            order                 solves per step   for
 All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
 Only the `hht` family and `extrapolated` take constraints and rotations; `conventional_hht` does too, as its authors
 printed it. Internal states are for the `hht` family, `extrapolated`, Rosenbrock and Runge-Kutta methods and `taylor`.
-Dry friction is for the `hht` family. In all of this, but for error control, `implicit_euler` belongs to it.
+Dry friction and contact are for the `hht` family, to which `implicit_euler` belongs in all of this but for error
+control.
 
 Some words: a motion is stiff if it contains vibrations or decays much faster than what one wants to see, such as those
 of stiff springs. A method is A-stable if no step size makes a decaying linear motion grow, and L-stable if besides it

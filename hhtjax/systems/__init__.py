@@ -96,6 +96,35 @@ included. `consistent_initial` moves a start onto the constraint.
 Constraints that depend on each other, always or in a singular position, are named with an error;
 `hht(redundant="least_squares")` solves them all the same, with the smallest multipliers.
 
+Contact
+-------
+
+`System(..., contact=Contact(gap, sliding, friction, restitution))`: bodies in a plane that land on each other, rest,
+stick, slide and let go, at up to four places. `gap(q, t, params)` gives the distances and `sliding(q, v, t, params)`
+the velocities along the surfaces; friction is Coulomb's, and restitution the part of the normal impulse that returns.
+Nothing is made smooth or soft: a body at rest does not creep, and a closed gap is closed to rounding.
+
+    M(q) w = Q + B^T L + J^T (f_N, f_T),    f_N >= 0,    f_N g = 0,    |f_T| <= mu f_N
+
+A ball that bounces to rest, and from when on it rests: sqrt(2 H/g) (1 + e)/(1 - e), with all its infinitely many
+bounces, of which those shorter than a step are left out:
+
+>>> floor = hhtjax.Contact(gap=lambda q, t, params: q[0], restitution="e")
+>>> ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: 0 * q - 9.81, contact=floor)
+>>> run = hhtjax.simulate(ball, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), {"e": 0.5}, dt=1e-2, num_steps=200)
+>>> run.check()
+>>> float(run.contact.normal[-1, 0]), round(float(run.contact.rests_since[-1, 0]), 3)               # 3 sqrt(2/9.81)
+(9.81, 1.355)
+
+The `hht` family solves it, in steps of any sizes, with M(q), constraints, rotations that keep the contact in its plane,
+internal states, inputs, `sweep` and `fit`. It is of order 2 in q, v and the forces through all impacts and switches,
+and derivatives are those of the run. Not in it: more than four contacts, sliding in two directions, restitution where a
+body meets one that rests on others. MuJoCo is made for these. Figures beside other ways are on a page,
+`experiments/contact/README.md`.
+
+A stiff spring in the place of contact needs far shorter steps, and makes energy where they are too long, without a sign
+of it: `hhtjax.analysis.energy_balance(system, run).check()` tells.
+
 Internal states
 ---------------
 

@@ -92,7 +92,8 @@ class System(Description):
             of `constraint`), or than 8, are taken to be dependent, and so are rows that the start shows to be. Rows
             of which only a tracer tells, or that become dependent later, are named by `check()`:
             `hht(redundant="least_squares")` is for these.
-        contact: a `Contact`: bodies that rest on each other, slide and let go. For the `hht` family.
+        contact: a `Contact`: bodies in a plane that land on each other, rest, stick, slide and let go. For the `hht`
+            family; `run.contact` has the forces.
 
     q and v are pytrees of the same structure and shapes; n is the number of entries of v. Only a rotation differs: a
     leaf R (..., 3, 3) of q, from material to spatial components, has the material angular velocity Om (..., 3) as its
