@@ -3,8 +3,8 @@
     z_0 d + M z + q = y,    z_0 from large to 0 by pivots, each of which keeps z, y >= 0
 
 Lemke's method finds a solution, or that there is none, for all copositive-plus M (z^T M z >= 0 for z >= 0): those of
-contacts with Coulomb friction among them. Rows of M may depend on each other. Ties are broken by the order of the
-columns, so that no set of pivots comes twice.
+contacts with Coulomb friction among them. Rows of M may depend on each other. Ties are broken by a perturbation of q,
+as small as one likes, so that no set of pivots comes twice.
 
 References: C. Lemke, Bimatrix equilibrium points and mathematical programming, Manage. Sci. 11, 1965, 681-689;
 R. Cottle, J.-S. Pang, R. Stone, The linear complementarity problem, 1992, Sec. 4.4 and 4.9.
@@ -12,8 +12,10 @@ R. Cottle, J.-S. Pang, R. Stone, The linear complementarity problem, 1992, Sec. 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -47,49 +49,49 @@ def complement(M: Array, q: Array) -> Complement:
     [2.5 0. ]
     """
     n = len(q)
-    # columns: y, z, z_0, and the right side; a row for each basic variable
-    tableau = jnp.concatenate([jnp.eye(n, dtype=q.dtype), -M, -jnp.ones((n, 1), q.dtype), q[:, None]], axis=1)
-    basis = jnp.arange(n)
-    first = _first_of(jnp.concatenate([q[:, None], tableau[:, :n]], axis=1), jnp.ones(n, bool))
-    entered = *_pivot(tableau, basis, first, 2 * n), (basis[first] + n) % (2 * n)
+    i, two_n = jnp.arange(n), 2 * n
+    # what is not basic, by columns: z, z_0; then the right side, and its perturbation. y_i is called i, and z_i n + i
+    perturbed = jnp.asarray(1 + np.arange(n) * 0.618034 % 1, q.dtype)
+    T = jnp.concatenate([-M, -jnp.ones((n, 1), q.dtype), q[:, None], perturbed[:, None]], axis=1)
+    names = i, jnp.concatenate([i + n, jnp.full(1, two_n)])  # of the rows, which are basic, and of the columns
     done = jnp.all(q >= 0)
 
+    def exchanged(T: Array, names: tuple, row: Array, column: Array):
+        """The tableau with the variables of a row and a column exchanged, and the column that is to follow."""
+        rows, columns = names
+        leaves, enters = rows[row], columns[column]
+        there = jnp.arange(T.shape[1]) == column
+        pivot, across = T[row, column], T[:, column]
+        own = jnp.where(there, 1, T[row]) / pivot
+        T = jnp.where(
+            (i == row)[:, None], own[None, :], jnp.where(there[None, :], 0, T) - across[:, None] * own[None, :]
+        )
+        rows, columns = jnp.where(i == row, enters, rows), jnp.where(there[: n + 1], leaves, columns)
+        return T, (rows, columns), jnp.argmax(columns == (leaves + n) % two_n), leaves == two_n
+
     def unfinished(carry: tuple) -> Array:
-        *_, ended, i = carry
-        return ~ended & (i < MOST_PIVOTS * n)
+        *_, ended, k = carry
+        return ~ended & (k < MOST_PIVOTS * n)
 
     def exchange(carry: tuple):
-        tableau, basis, column, _, i = carry
-        rows = _allowed(tableau[:, column])
-        ratios = jnp.concatenate([tableau[:, -1:], tableau[:, :n]], axis=1)
-        ratios = ratios / jnp.where(rows, tableau[:, column], 1)[:, None]
-        row = _first_of(ratios, rows)
-        last = rows & (basis == 2 * n) & (ratios[:, 0] <= ratios[row, 0] + _rounding(ratios[row, 0]))
-        row = jnp.where(jnp.any(last), jnp.argmax(last), row)
-        leaves, ray = basis[row], ~jnp.any(rows)
-        new, there = _pivot(tableau, basis, row, column)
-        tableau, basis = jnp.where(ray, tableau, new), jnp.where(ray, basis, there)
-        return tableau, basis, (leaves + n) % (2 * n), (leaves == 2 * n) | ray, i + 1
+        T, names, column, _, k = carry
+        falls = T[:, column] > _small(q.dtype) * jnp.max(jnp.abs(T[:, column]))  # as that of the column grows
+        ratios = T[:, n + 1 :] / jnp.where(falls, T[:, column], 1)[:, None]
+        row = _first_of(ratios, falls)
+        last = falls & (names[0] == two_n) & (ratios[:, 0] <= ratios[row, 0] + _rounding(ratios[row, 0]))
+        row, ray = jnp.where(jnp.any(last), jnp.argmax(last), row), ~jnp.any(falls)
+        new = exchanged(T, names, row, column)
+        T, names, column, ended = jax.tree.map(partial(jnp.where, ray), (T, names, column, True), new)
+        return T, names, column, ended, k + 1
 
-    tableau, basis, *_ = lax.while_loop(unfinished, exchange, (*entered, done, 0))
-    left = jnp.sum(jnp.where(basis == 2 * n, tableau[:, -1], 0))  # z_0, which may stay at 0
-    here = basis[None, :] == (n + jnp.arange(n))[:, None]
+    row = _first_of(T[:, n + 1 :], jnp.ones(n, bool))
+    T, names, column, _ = exchanged(T, names, row, jnp.asarray(n))
+    T, (rows, _), *_ = lax.while_loop(unfinished, exchange, (T, names, column, done, 0))
+    left = jnp.sum(jnp.where(rows == two_n, T[:, n + 1], 0))  # z_0, which may stay at 0
+    here = rows[None, :] == (n + i)[:, None]
     basic = jnp.any(here, axis=1) & ~done
-    z = jnp.where(basic, jnp.sum(jnp.where(here, tableau[:, -1], 0), axis=1), 0)
+    z = jnp.where(basic, jnp.sum(jnp.where(here, T[:, n + 1], 0), axis=1), 0)
     return Complement(jnp.maximum(z, 0), basic, done | (left <= _small(q.dtype)))
-
-
-def _pivot(tableau: Array, basis: Array, row: Array, column: Array | int):
-    """The tableau and the basis with the variable of a column in that of a row."""
-    here = jnp.arange(len(basis)) == row
-    own = (tableau[row] / tableau[row, column])[None, :]
-    tableau = jnp.where(here[:, None], own, tableau - tableau[:, column][:, None] * own)
-    return tableau, jnp.where(here, column, basis)
-
-
-def _allowed(column: Array) -> Array:
-    """Rows whose basic variable falls as that of the column grows."""
-    return column > _small(column.dtype) * jnp.max(jnp.abs(column))
 
 
 def _small(dtype: np.dtype) -> float:
@@ -97,14 +99,11 @@ def _small(dtype: np.dtype) -> float:
 
 
 def _first_of(ratios: Array, rows: Array) -> Array:
-    """Of these rows that with the smallest ratios (n, k), in the order of a dictionary."""
-
-    def narrowed(rows: Array, column: Array):
-        x = jnp.where(rows, column, jnp.inf)
-        least = jnp.min(x)
-        return rows & (x <= least + _rounding(least)), None
-
-    return jnp.argmax(lax.scan(narrowed, rows, ratios.T)[0])
+    """Of these rows that with the smallest of ratios (n, 2), the second where the first are tied."""
+    first = jnp.where(rows, ratios[:, 0], jnp.inf)
+    least = jnp.min(first)
+    tied = rows & (first <= least + _rounding(least))
+    return jnp.argmin(jnp.where(tied, ratios[:, 1], jnp.inf))
 
 
 def _rounding(x: Array) -> Array:
