@@ -1,5 +1,7 @@
 """Bodies that touch: they rest, stick, slide, let go, and land."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -421,6 +423,16 @@ def test_bad_contacts_are_named():
         hhtjax.System(
             jnp.ones(1), lambda q, v, t, params: -q, friction=lambda q, v, t, params: 1.0, contact=hhtjax.Contact(gap)
         )
+
+
+def test_a_system_that_is_there_gets_contact():
+    contact = hhtjax.Contact(gap)
+    of_dynamics = hhtjax.System(dynamics=lambda q, v, w, t, params: w + GRAVITY)
+    assert dataclasses.replace(of_dynamics, contact=contact).contact is contact
+    falling = hhtjax.System.from_lagrangian(lambda q, v, t, params: jnp.sum(v**2) / 2 - GRAVITY * q[0], contact=contact)
+    assert falling.contact is contact
+    with pytest.raises(TypeError, match="`dynamics` holds what `force` says"):
+        hhtjax.System(force=lambda q, v, t, params: -q, dynamics=lambda q, v, w, t, params: w)
 
 
 def test_what_does_not_know_contact_says_so():

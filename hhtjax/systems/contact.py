@@ -59,6 +59,8 @@ class Contact(Description):
         TypeError, ValueError: an argument of a wrong kind, or out of its range; friction without `sliding`. In runs: a
             start in which bodies overlap, or touch and approach each other.
 
+    A system that is there already, such as that of a mechanism, gets it by `dataclasses.replace(system, contact=)`.
+
     A block that slides 0.204 m, v^2/(2 mu g), and stays there:
 
     >>> import jax.numpy as jnp, hhtjax

@@ -200,7 +200,7 @@ class System(Description):
         require_function("System", "dynamics", dynamics, f"dynamics(q, v, w, {z}t, params)")
         for name in ("force", "inertia"):
             given = getattr(self, name)
-            if given is not None:
+            if given is not None and getattr(given, "dynamics", None) is not dynamics:  # else dataclasses.replace
                 raise TypeError(f"System: `dynamics` holds what `{name}` says: give one of them; received both.")
         object.__setattr__(self, "force", DynamicsForce(dynamics))
         if self.mass is None and self.internal is None:
@@ -217,6 +217,7 @@ class System(Description):
         friction: Callable | None = None,
         sliding=None,
         constraint=None,
+        contact: Contact | None = None,
     ) -> System:
         """The system of Lagrange's equations  d/dt (dL/dv) - dL/dq = F + B^T L, with M and Q by autodiff.
 
@@ -232,7 +233,7 @@ class System(Description):
                 for one that has none.
             force: F, the forces that no potential holds (damping, inputs): `force(q, v, t, params)`.
             internal: as for `System`; then `force(q, v, z, t, params)`.
-            friction, sliding, constraint: as for `System`. (Events are arguments of `simulate`.)
+            friction, sliding, constraint, contact: as for `System`. (Events are arguments of `simulate`.)
 
         Returns:
             A `System`, whose `mass(q, t, params)` and `inertia(q, w, t, params)` are those of L.
@@ -264,8 +265,8 @@ class System(Description):
             arguments = "q, v, t, params" if internal is None else "q, v, z, t, params"
             require_function(caller, "force", force, f"force({arguments})")
         own_force = (LagrangianForce if internal is None else InternalLagrangianForce)(lagrangian, force)
-        inertia = LagrangianInertia(lagrangian)
-        return cls(LagrangianMass(lagrangian), own_force, constraint, inertia, internal, friction, sliding)
+        parts = LagrangianMass(lagrangian), own_force, constraint, LagrangianInertia(lagrangian)
+        return cls(*parts, internal, friction, sliding, contact=contact)
 
     @classmethod
     def from_elements(
