@@ -56,7 +56,7 @@ MANY = 2.0  # the code of a step, beside those of contact_instant.py
 
 
 def bind_contact(method, system: FlatSystem, params: PyTree, dt: Array):
-    """The step."""
+    """The step, State -> (State, Info)."""
     mu = system.contact.friction(params)
 
     def step(s: State):
@@ -91,7 +91,8 @@ def _in_parts(method, system: FlatSystem, params: PyTree, found: tuple, s: State
 
     first, more = SWITCHES
     way = lax.scan(visit, way, length=1 + 2 * (first + more * system.contact.size))[0]
-    end = way.end._replace(t=s.t + h, a=way.end.w)
+    divided = way.rest < h  # if so, a is made for another step than the next
+    end = way.end._replace(t=s.t + h, a=jnp.where(divided, way.end.w, way.end.a))
     code = jnp.where((way.done == 0) & (way.info.contact == FINE), MANY, way.info.contact)
     return end, way.info._replace(contact=code)
 
