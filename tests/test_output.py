@@ -233,7 +233,7 @@ def test_a_run_without_its_path_is_refused_by_name(short):
 
 
 WRONG = {
-    "names": (lambda y: y, TypeError, "must be a function of some of q, v, w, L, z, zdot, friction, sticking, contact, t and p"),
+    "names": (lambda y: y, TypeError, "of some of q, v, w, L, z, zdot, friction, sticking, contact, t and p"),
     "order": (lambda q, /: q, TypeError, "received one of (q)"),
     "no function": (3, TypeError, "simulate: `output` must be a function output(...); received 3"),
     "nothing": (lambda q: None, TypeError, "`output` must return a pytree of arrays, one or more; received nothing"),
