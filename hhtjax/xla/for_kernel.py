@@ -94,12 +94,15 @@ class _Copier:
         return self.done[id(jaxpr)][1]
 
     def _jaxpr(self, jaxpr: Jaxpr) -> Jaxpr:
-        new, eqns = {}, []  # what stands for a variable
+        new, eqns, given = {}, [], jaxpr.eqns  # what stands for a variable
+        if self.sines:
+            given, new = _each_sine_once(given)
+            given = _with_sines_together(given)
 
         def read(x: Literal | Var) -> Literal | Var:
             return x if isinstance(x, Literal) else new.get(x, x)
 
-        for eqn in _with_sines_together(jaxpr.eqns) if self.sines else jaxpr.eqns:
+        for eqn in given:
             invars = [read(x) for x in eqn.invars]
             if self.other is _in_kernel:
                 if eqn.primitive.name in IDENTITIES:
@@ -336,6 +339,25 @@ def _scattered(combine: Callable, dims, x: Array, indices: Array, updates: Array
 
 
 # sines
+
+
+def _each_sine_once(eqns: list):
+    """The equations without sines and cosines that are there already, of the same number, and what stands for these: a
+    sine is a call, of which XLA does not see that it comes twice."""
+    made, same, known, instead = [], {}, {}, {}  # variable -> the first one of its value; what makes it -> variables
+    for eqn in eqns:
+        operands = tuple((str(x), x.aval) if isinstance(x, Literal) else same.get(x, x) for x in eqn.invars)
+        try:
+            found = known.setdefault((eqn.primitive, operands, tuple(eqn.params.items())), eqn.outvars)
+        except TypeError:  # parameters that nothing is known of
+            found = eqn.outvars
+        if found is not eqn.outvars and not eqn.effects:
+            same.update(zip(eqn.outvars, found, strict=True))
+            if eqn.primitive.name in ("sin", "cos"):
+                instead[eqn.outvars[0]] = found[0]
+                continue
+        made.append(eqn)
+    return made, instead
 
 
 def _with_sines_together(eqns: list):
