@@ -388,6 +388,23 @@ def test_events_and_contact():
     assert bool(found.output["pushes"][-1, 0])
 
 
+@pytest.mark.slow
+def test_what_is_known_of_contacts_survives_an_event():
+    """One that changes nothing, while the ball rests and slides."""
+    scene = ball()
+    same = hhtjax.Event(at=2.505, reset=lambda q, v, t, params: v)
+    a, b = (
+        hhtjax.simulate(
+            scene.system, PREDICTOR, scene.q0, jnp.array([6.0, 0.0]), scene.params, dt=0.01, num_steps=300, **how
+        )
+        for how in ({}, {"events": [same]})
+    )
+    b.check()
+    assert int(a.contact.impacts[-1, 0]) == int(b.contact.impacts[-1, 0]) > 5
+    assert a.contact.rests_since[-1, 0] == b.contact.rests_since[-1, 0] > 1
+    assert jnp.max(jnp.abs(a.q - b.q)) < 1e-5
+
+
 # ----------------------------------------------------------------------------
 # What is refused, and what is told.
 

@@ -65,7 +65,7 @@ def pass_events(context: EventContext, params: PyTree, part: SubStep, h: Array):
     met = part.met
 
     def anew(s: State, params: PyTree) -> State:
-        return begin(context, s.q, s.v, s.t, params, h, moves=False)
+        return begin(context, s, s.v, params, h, moves=False)
 
     now = context.params(params, met.modes)
     end = call_where(anew, (part.divided > 0) & ~met.ended, part.end, now)
@@ -106,11 +106,13 @@ def flag(part: SubStep, bad: Array, code: int, which: Array) -> SubStep:
     return part._replace(met=met)
 
 
-def begin(context: EventContext, q: Array, v: Array, t: Array, params: PyTree, h: Array, moves: bool = True) -> State:
-    """The state from which a step of size h goes at a new start; moves: whether its velocity may be another."""
-    return staged(lambda q, v, t, h: entered(context.stepper, context.flat, q, v, t, params, h, moves=moves)[1])(
-        q, v, t, h
+def begin(context: EventContext, e: State, v: Array, params: PyTree, h: Array, moves: bool = True) -> State:
+    """The state from which a step of size h goes at a new start, behind e with velocities v; moves: whether they may be
+    others."""
+    new = staged(lambda q, v, t, h: entered(context.stepper, context.flat, q, v, t, params, h, moves=moves)[1])(
+        e.q, v, e.t, h
     )
+    return new if e.contact is None else new._replace(contact=new.contact.following(e.contact, e.t))
 
 
 def meet(context: EventContext, now: tuple, found: Found, h: Array, params: PyTree):
@@ -160,7 +162,7 @@ def behind(
     then = context.params(params, modes)
     ends = pick(this, jnp.asarray(events.ends, h.dtype)) > 0
     rest = jnp.where(ends, 0, part.rest - tau)
-    start = begin(context, e.q, v, e.t, then, h)  # whole: what is left may be far too short to tell what is stiff
+    start = begin(context, e, v, then, h)  # whole: what is left may be far too short to tell what is stiff
     end, more = go(context, then, start, rest, h, h)
     end = end._replace(t=jnp.where(ends, e.t, part.end.t))
 
