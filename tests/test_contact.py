@@ -484,6 +484,27 @@ def test_bad_starts_are_named():
 
 
 @pytest.mark.slow
+def test_coefficients_out_of_range_are_named():
+    """Those that are in params, too; negative friction would drive what slides."""
+    contact = hhtjax.Contact(lambda q, t, params: q[1], lambda q, v, t, params: v[0], "mu", "e")
+    system = hhtjax.System(jnp.ones(2), lambda q, v, t, params: jnp.array([0.0, -GRAVITY]), contact=contact)
+
+    def slides(mu, e):
+        return run(Scene(system, jnp.zeros(2), jnp.array([1.0, 0.0]), {"mu": mu, "e": e}, 0.1), 2)
+
+    for mu in (-0.2, jnp.nan, jnp.inf):
+        with pytest.raises(ValueError, match="`friction` of the contacts must be finite numbers, 0 or more; received"):
+            slides(mu, 0.5)
+    with pytest.raises(
+        ValueError, match=r"`restitution` of the contacts must be numbers in \[0, 1\]; received \[1.5\]"
+    ):
+        slides(0.2, 1.5)
+    for mu, e in ((-0.2, 0.5), (jnp.nan, 0.5), (0.2, 1.5)):
+        with pytest.raises(hhtjax.SimulationError, match=r"negative or not finite, or its `restitution` is not in"):
+            jax.jit(slides)(mu, e).check()
+
+
+@pytest.mark.slow
 def test_failures_are_named(monkeypatch):
     def failure(scene: Scene, steps: int, **params):
         with pytest.warns(hhtjax.FailedRunWarning):

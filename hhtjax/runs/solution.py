@@ -122,7 +122,7 @@ QUANTITIES = (
     "the internal state z", "the rate of the internal state z",
 )  # fmt: skip
 MASS = (None, "symmetric", "positive definite", "the same at all velocities")
-APART = 5
+APART, OUT_OF_RANGE = 5, 6
 CONTACT = {  # what went wrong with contacts, by the code of a step
     1: "no contact forces were found that neither pull nor hold more than friction allows. Take a smaller dt, or less "
     "`friction`",
@@ -132,6 +132,7 @@ CONTACT = {  # what went wrong with contacts, by the code of a step
     4: "bodies that touch each other meet at several contacts at once, with a `restitution` above 0: what they do then "
     "depends on the order. Take restitution 0",
     5: "at the start bodies overlap, or touch and go into each other",
+    6: "`friction` of a contact is negative or not finite, or its `restitution` is not in [0, 1]",
 }
 WAYS = {
     INDEFINITE: f". {MASSLESS}",

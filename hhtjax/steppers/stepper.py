@@ -75,7 +75,7 @@ class ContactState(NamedTuple):
     code: Array
 
     def following(self, before: ContactState, t: Array) -> ContactState:
-        """This one, of a new start at t, with what is known from before: impacts, and since when contacts are closed."""
+        """This one, of a new start at t, with what is known before it: impacts, and since when contacts are closed."""
         return self._replace(since=jnp.where(before.closed > 0, before.since, t), impacts=before.impacts)
 
 

@@ -1,4 +1,4 @@
-"""Where contacts may start: apart, or closed and not about to be pressed together."""
+"""Where contacts may start: apart, or closed and not about to be pressed together; with coefficients in range."""
 
 from __future__ import annotations
 
@@ -18,17 +18,24 @@ if TYPE_CHECKING:
 
 CLOSED = 1e-9  # of the size of q, as which a gap is 0
 STILL = 1e-6  # of the velocities that a rate is made of, as which it is 0
-OVERLAPS, APPROACHES = 1, 2
+OVERLAPS, APPROACHES, RANGE = 1, 2, 3
 
 
 def require_contact_start(
     caller: str, system, q0: PyTree, v0: PyTree, t0: Real, params: PyTree, z0: PyTree = None
 ) -> None:
-    """An error for a start in which bodies overlap, or touch and go into each other; tracers pass."""
+    """An error for a start in which bodies overlap, or touch and go into each other, and for coefficients out of their
+    range; tracers pass."""
     found = known_now(_start, system, q0, v0, t0, params, z0)
     if found is None:
         return
-    gap, rate, flaws = map(np.asarray, found)
+    gap, rate, friction, restitution, flaws = map(np.asarray, found)
+    for name, x, most, range_ in (
+        ("friction", friction, np.inf, "finite numbers, 0 or more"),
+        ("restitution", restitution, 1, "numbers in [0, 1]"),
+    ):
+        if not np.all((x >= 0) & (x <= most) & np.isfinite(x)):
+            raise ValueError(f"{caller}: `{name}` of the contacts must be {range_}; received {x}.")
     flaws = flaws.reshape(-1, flaws.shape[-1]).max(axis=0)
     for i in np.flatnonzero(flaws)[:1]:
         g, speed = (x.reshape(-1, x.shape[-1])[:, i] for x in (gap, rate))
@@ -44,11 +51,14 @@ def require_contact_start(
 
 @Programs
 def _start(system, q0: PyTree, v0: PyTree, t0: Array, params: PyTree, z0: PyTree):
-    """The gaps, their rates, and what is wrong with each."""
+    """The gaps, their rates, the coefficients, and what is wrong with each contact."""
     flat, q, v = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
     m = flat.contact.size
-    return flat.contact.gap(q, t, params), rates(flat, q, v, t, params)[:m], start_flaws(flat, q, v, t, params)
+    contact = flat.contact
+    coefficients = contact.friction(params), contact.restitution(params)
+    flaws = start_flaws(flat, q, v, t, params)
+    return contact.gap(q, t, params), rates(flat, q, v, t, params)[:m], *coefficients, flaws
 
 
 def start_flaws(flat: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) -> Array:
@@ -60,7 +70,9 @@ def start_flaws(flat: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) 
     fast = matvec(jnp.abs(directions(flat, q, t, params)[:m]), jnp.abs(v))
     still = max(STILL, 1e3 * float(jnp.finfo(v.dtype).eps)) * fast
     approaches = (gap <= zero) & (y < -still)
-    return jnp.where(gap < -zero, OVERLAPS, jnp.where(approaches, APPROACHES, 0))
+    mu, e = flat.contact.friction(params), flat.contact.restitution(params)
+    in_range = (mu >= 0) & jnp.isfinite(mu) & (e >= 0) & (e <= 1)
+    return jnp.where(in_range, jnp.where(gap < -zero, OVERLAPS, jnp.where(approaches, APPROACHES, 0)), RANGE)
 
 
 def nearly_closed(q: Array) -> Array:
