@@ -102,7 +102,7 @@ def standing(points, inertia: float, q0: Any, v0: Any, params: dict, T: float, r
         return jnp.stack([v[0] - v[2] * r[1] for r in places(q)])
 
     def force(q, v, t, params):
-        return jnp.array([0.0, -GRAVITY, 0.0])
+        return jnp.array([0.0, -GRAVITY, 0.0], q.dtype)
 
     contact = hhtjax.Contact(gap, sliding, "mu", restitution)
     return Scene(hhtjax.System(jnp.array([1.0, 1.0, inertia]), force, contact=contact), q0, v0, params, T)

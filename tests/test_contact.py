@@ -375,6 +375,19 @@ def test_other_ways_to_run_it():
 
 
 @pytest.mark.slow
+def test_contacts_that_depend_on_each_other_in_float32():
+    """A rod that falls flat, and lies there: friction at both ends is known in its sum alone."""
+    scene = rod()
+    half = [jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), x) for x in (scene.q0, scene.v0, scene.params)]
+    with pytest.warns(hhtjax.PrecisionWarning):
+        found = hhtjax.simulate(scene.system, PREDICTOR, *half, dt=0.01, num_steps=100)
+    found.check()
+    assert found.q.dtype == jnp.float32
+    assert bool(found.contact.closed[-1].all())
+    assert jnp.max(jnp.abs(found.q[-1].astype(jnp.float64) - run(scene, 100).q[-1])) < 1e-4
+
+
+@pytest.mark.slow
 def test_events_and_contact():
     scene = ball()
     low = hhtjax.Event(guard=lambda q, v, t, params: q[1] - 0.3)

@@ -10,7 +10,7 @@ Lemke's method finds a solution (Stewart, Trinkle 1996). Rows may depend on each
 from __future__ import annotations
 
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -19,14 +19,19 @@ from hhtjax.description import Array
 from hhtjax.numerics.complementarity import complement
 from hhtjax.numerics.dense_lu import diagonal, matvec, with_slope
 
-PROXIMAL = 1e-9  # of a row, added to its diagonal: contacts may depend on each other
+PROXIMAL = 1e-9  # of a row, added to its diagonal: contacts may depend on each other; in float32 100 roundings
+
+
+def proximal(dtype: Any) -> float:
+    """The part of a row that is added to its diagonal: large beside roundings, by which rows that depend differ."""
+    return max(PROXIMAL, 100 * float(jnp.finfo(dtype).eps))
 
 
 class SmallInverse(NamedTuple):
     """b -> S^-1 b of a small matrix whose rows may depend on each other, for b that allow it."""
 
     S: Array
-    near: Array  # the inverse of S, a little regularised, which is right to PROXIMAL
+    near: Array  # the inverse of S, a little regularised, which is right to `proximal`
 
     def __call__(self, b: Array) -> Array:
         x = matvec(self.near, b)
@@ -38,7 +43,7 @@ def inverted(S: Array) -> SmallInverse:
     if len(S) == 2:
         return SmallInverse(S, with_slope(_eliminated, S))
     largest = reduce(jnp.maximum, jnp.abs(S).T)
-    return SmallInverse(S, with_slope(_eliminated, S + jnp.diag(PROXIMAL * largest)))
+    return SmallInverse(S, with_slope(_eliminated, S + jnp.diag(proximal(S.dtype) * largest)))
 
 
 def _eliminated(S: Array) -> Array:
@@ -90,7 +95,7 @@ def choice(K: Array, y: Array, mu: Array, off: Array, here: Array, sliding: Arra
     f = jnp.concatenate([f_N, jnp.where(rests, one_way - other, -sliding * mu * f_N)])
     along = (y + matvec(K, f))[m:]
     pushes, one_way, other, slips = found.basic.reshape(4, m)
-    jams = jnp.any(here & (sliding != 0) & (diagonal(of_N[:m]) <= PROXIMAL))
+    jams = jnp.any(here & (sliding != 0) & (diagonal(of_N[:m]) <= proximal(K.dtype)))
     sticks = jnp.where(slips, one_way & other, one_way | other)
     # what slides off with no speed yet does so against its force
     direction = jnp.where(one_way, -1, jnp.where(other, 1, jnp.sign(along)))

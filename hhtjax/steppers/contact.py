@@ -25,7 +25,7 @@ from jax import lax
 from hhtjax.description import Array, PyTree
 from hhtjax.numerics.batched_cond import call_where, tree_where
 from hhtjax.numerics.checkpointed_scan import checkpoint
-from hhtjax.numerics.coulomb import PROXIMAL, inverted
+from hhtjax.numerics.coulomb import inverted, proximal
 from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.steppers.constrained import report_constraints
 from hhtjax.steppers.contact_instant import FINE, JAMMED, behind
@@ -163,7 +163,7 @@ def _part(method, system: FlatSystem, params: PyTree, s: State, h: Array):
     gaps = tuple(jnp.where(closed, 0, gap(x.q, x.t)) for x in (s, s1))
     ends = tuple(jnp.where(held, 0, x) for x in (y(s.q, s.v, s.t), y1))
     course = Course(h, gaps, ends, (f0, f1), _roundings(s1, J, f1))
-    jams = jnp.any(closed & (presses(K, modes, mu) <= PROXIMAL * jnp.abs(diagonal(K)[:m])))
+    jams = jnp.any(closed & (presses(K, modes, mu) <= proximal(K.dtype) * jnp.abs(diagonal(K)[:m])))
     info = info._replace(contact=jnp.maximum(s.contact.code, jnp.where(jams, JAMMED, FINE).astype(h.dtype)))
     return s1, info if B is None else report_constraints(method, system, params, h, s, s1, info, B), course
 
