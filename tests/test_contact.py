@@ -418,6 +418,35 @@ def test_what_is_known_of_contacts_survives_an_event():
     assert jnp.max(jnp.abs(a.q - b.q)) < 1e-5
 
 
+@pytest.mark.slow
+def test_gaps_of_curved_floors_are_closed():
+    """Where two corrections of a step do not close them."""
+
+    def height(x):
+        return jnp.sin(3 * x) / 2
+
+    wavy = hhtjax.Contact(lambda q, t, params: q[1] - height(q[0]))
+    system = hhtjax.System(jnp.ones(2), lambda q, v, t, params: jnp.array([0.0, -GRAVITY]), contact=wavy)
+    start = jnp.array([-0.9, height(-0.9)]), jnp.array([0.5, 0.75 * jnp.cos(-2.7)])
+    found = hhtjax.simulate(system, PREDICTOR, *start, dt=0.05, num_steps=40)
+    found.check()
+    assert bool(found.contact.closed.all())
+    assert not bool(found.contact.sticking.any())
+    assert jnp.max(jnp.abs(found.q[:, 1] - height(found.q[:, 0]))) < 1e-12
+
+
+@pytest.mark.slow
+def test_a_guide_without_clearance():
+    """Two contacts that face each other: one of them is closed, the other lets go, and the body stays where it is."""
+    guide = hhtjax.Contact(lambda q, t, params: jnp.stack([q[0], -q[0]]), restitution=0.5)
+    system = hhtjax.System(jnp.ones(1), lambda q, v, t, params: 3 * jnp.sin(3 * t) + 0 * q, contact=guide)
+    found = hhtjax.simulate(system, PREDICTOR, jnp.zeros(1), jnp.zeros(1), dt=0.004, num_steps=1000)
+    found.check()
+    assert jnp.max(jnp.abs(found.q)) < 1e-15
+    push = found.contact.normal[:, 1] - found.contact.normal[:, 0]
+    assert jnp.max(jnp.abs(push - 3 * jnp.sin(3 * found.t))) < 1e-10
+
+
 # ----------------------------------------------------------------------------
 # What is refused, and what is told.
 
@@ -486,13 +515,13 @@ def test_what_does_not_know_contact_says_so():
 
 @pytest.mark.slow
 def test_bad_starts_are_named():
-    contact, flawed = hhtjax.Contact(gap), "at the start bodies overlap, or touch and go into each other"
+    contact = hhtjax.Contact(gap)
     with pytest.raises(ValueError, match=r"`q0` must keep bodies apart: the gap of contact 0 is -0.1; expected 0"):
         at_rest(contact, q=-0.1)
     with pytest.raises(ValueError, match="`v0` must not press bodies together that touch: the gap of contact 0 is 0"):
         at_rest(contact, v=-1.0)
-    for start in ((-0.1, 0.0), (0.0, -1.0)):
-        with pytest.raises(hhtjax.SimulationError, match=flawed):
+    for *start, flaw in ((-0.1, 0.0, "bodies overlap"), (0.0, -1.0, "bodies touch and go into each other")):
+        with pytest.raises(hhtjax.SimulationError, match=f"failed: at the start {flaw}"):
             jax.jit(lambda q, v: at_rest(contact, q=q, v=v))(*start).check()
 
 

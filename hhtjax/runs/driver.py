@@ -20,12 +20,12 @@ from hhtjax.numerics.batched_cond import if_any, tree_where
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.primitives import in_turn
 from hhtjax.runs.event_step import EventContext, EventState, Pieces, SubStep, asks, pass_events, reaching, unnoted
-from hhtjax.runs.solution import APART, FINE, INTERNAL_STATE, OUT_OF_RANGE, ContactForces, Failure, Log, Solution
+from hhtjax.runs.solution import FINE, INTERNAL_STATE, ContactForces, Failure, Log, Solution
 from hhtjax.steppers.friction_switching import is_settled
 from hhtjax.steppers.stepper import Info, bound, entered, join_info, public, step_start
 from hhtjax.steppers.variable_step import resized_step
 from hhtjax.systems import zero_order_hold
-from hhtjax.systems.contact_start import RANGE, start_flaws
+from hhtjax.systems.contact_start import start_flaws
 from hhtjax.systems.events import flatten_events
 from hhtjax.systems.matrices import OF_VELOCITY, mass_flaw
 from hhtjax.systems.system import mass_reads_velocity
@@ -239,8 +239,7 @@ def with_contact_start(run: Solution, flat: FlatSystem, start: State, params: Py
     """The run, or one that has failed where bodies overlap at the start, or go into each other, or where coefficients
     are out of their range."""
     flaw = jnp.max(start_flaws(flat, start.q, start.v, start.t, params))
-    code = jnp.where(flaw == RANGE, OUT_OF_RANGE, jnp.where(flaw > 0, APART, run.failure.contact))
-    step = jnp.where(flaw > 0, 1, run.failure.step)
+    step, code = jnp.where(flaw > 0, 1, run.failure.step), jnp.where(flaw > 0, flaw, run.failure.contact)
     return run._replace(failure=run.failure._replace(step=step, contact=code))
 
 

@@ -16,6 +16,7 @@ from hhtjax.primitives import block_written
 from hhtjax.steppers.friction_switching import DEPENDENT
 from hhtjax.steppers.stepper import Info
 from hhtjax.systems.constraints import SWITCHED_OFF
+from hhtjax.systems.contact import Fault
 from hhtjax.systems.matrices import INDEFINITE, MASSLESS, OF_VELOCITY
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class ContactForces(NamedTuple):
         normal: (K + 1, m), the forces that press bodies apart, N; 0 where they do not touch.
         friction: (K + 1, m), those along the surfaces, positive against negative sliding.
         closed: (K + 1, m), whether bodies touch.
-        sticking: (K + 1, m), whether they also stick.
+        sticking: (K + 1, m), whether they also stick; never without friction.
         impacts: (K + 1, m), how many impacts there have been.
         rests_since: (K + 1, m), since when a closed contact has been so, s; -inf: from the start on; inf: it is open.
             Of one that bounced, the time at which infinitely many bounces would have ended.
@@ -59,7 +60,7 @@ class ContactForces(NamedTuple):
         closed = contact.closed > 0
         since = jnp.where(closed, contact.since, jnp.inf)
         forces = contact.f[..., :m], contact.f[..., m:]
-        return cls(*forces, closed, closed & (contact.sig == 0), contact.impacts.astype(jnp.int32), since)
+        return cls(*forces, closed, contact.sticks > 0, contact.impacts.astype(jnp.int32), since)
 
 
 @shown
@@ -110,7 +111,7 @@ class Failure(NamedTuple):
         if known(self.friction):
             return "the dry friction was not found"
         if contact := known(self.contact):
-            return CONTACT[int(contact)].split(". ")[0]
+            return CONTACT[float(contact)].split(". ")[0]
         row = known(self.row)
         if row is not None and row >= 0:
             return "a constraint depends on others"
@@ -122,17 +123,19 @@ QUANTITIES = (
     "the internal state z", "the rate of the internal state z",
 )  # fmt: skip
 MASS = (None, "symmetric", "positive definite", "the same at all velocities")
-APART, OUT_OF_RANGE = 5, 6
-CONTACT = {  # what went wrong with contacts, by the code of a step
-    1: "no contact forces were found that neither pull nor hold more than friction allows. Take a smaller dt, or less "
-    "`friction`",
-    2: "contacts let go, stick and slide too often within the step. Take a smaller dt",
-    3: "a contact jams: with so much friction, more normal force presses the bodies together (Painleve). Take less "
-    "`friction`, or compliance in `force`",
-    4: "bodies that touch each other meet at several contacts at once, with a `restitution` above 0: what they do then "
-    "depends on the order. Take restitution 0",
-    5: "at the start bodies overlap, or touch and go into each other",
-    6: "`friction` of a contact is negative or not finite, or its `restitution` is not in [0, 1]",
+CONTACT = {  # what went wrong with contacts
+    Fault.NO_FORCES: "no contact forces were found that neither pull nor hold more than friction allows. Take a "
+    "smaller dt, or less `friction`",
+    Fault.MANY: "contacts let go, stick and slide too often within the step. Take a smaller dt",
+    Fault.JAMMED: "a contact jams: with so much friction, more normal force presses the bodies together (Painleve). "
+    "Take less `friction`, or compliance in `force`",
+    Fault.SEVERAL: "bodies that touch each other meet at several contacts at once, with a `restitution` above 0: what "
+    "they do then depends on the order. Take restitution 0",
+    Fault.OPEN: "the gap of a closed contact was not brought to 0: its surfaces are too curved for the step. Take a "
+    "smaller dt",
+    Fault.OVERLAP: "at the start bodies overlap",
+    Fault.APPROACH: "at the start bodies touch and go into each other",
+    Fault.RANGE: "the `friction` of a contact must be a finite number, 0 or more, and its `restitution` lie in [0, 1]",
 }
 WAYS = {
     INDEFINITE: f". {MASSLESS}",
@@ -311,7 +314,7 @@ class Solution(NamedTuple):
                 "matrices M, C and K are too far apart in size for this step, or for float32"
             )
         if contact:
-            return CONTACT[int(contact)]
+            return CONTACT[float(contact)]
         if np.isinf(friction):
             return "a limit of the dry friction is negative or not finite: see `friction` of the System"
         if friction == DEPENDENT:

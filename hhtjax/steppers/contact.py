@@ -28,7 +28,7 @@ from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.coulomb import inverted, proximal
 from hhtjax.numerics.dense_lu import diagonal, matvec
 from hhtjax.steppers.constrained import report_constraints
-from hhtjax.steppers.contact_instant import FINE, JAMMED, behind
+from hhtjax.steppers.contact_instant import past_switch
 from hhtjax.steppers.contact_modes import (
     ROUNDING,
     Course,
@@ -43,7 +43,7 @@ from hhtjax.steppers.contact_modes import (
 from hhtjax.steppers.friction import each_row, equations_of, free_step
 from hhtjax.steppers.stepper import join_info
 from hhtjax.steppers.variable_step import drifted, moved
-from hhtjax.systems.contact import directions, rates, rates_of_rates, reaction
+from hhtjax.systems.contact import Fault, directions, rates, rates_of_rates, reaction
 from hhtjax.systems.friction import across
 
 if TYPE_CHECKING:
@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
 SWITCHES = 4, 2  # in a step, and for each contact
-CORRECTIONS = 2  # of the gap
-MANY = 2.0  # the code of a step, beside those of contact_instant.py
+CORRECTIONS, MORE = 2, 24  # of the gap; and where it is not closed yet
+CLOSED, OPEN = 1.0, 64.0  # of what may be rounding, up to which a gap is closed, and beyond which one has stayed open
 
 
 def bind_contact(method, system: FlatSystem, params: PyTree, dt: Array):
@@ -93,7 +93,7 @@ def _in_parts(method, system: FlatSystem, params: PyTree, found: tuple, s: State
     way = lax.scan(visit, way, length=1 + 2 * (first + more * system.contact.size))[0]
     divided = way.rest < h  # if so, a is made for another step than the next
     end = way.end._replace(t=s.t + h, a=jnp.where(divided, way.end.w, way.end.a))
-    code = jnp.where((way.done == 0) & (way.info.contact == FINE), MANY, way.info.contact)
+    code = jnp.where((way.done == 0) & (way.info.contact == 0), Fault.MANY, way.info.contact)
     return end, way.info._replace(contact=code)
 
 
@@ -107,7 +107,8 @@ def _go_on(method, system: FlatSystem, params: PyTree, way: Way, h: Array) -> Wa
     s1 = tree_where(aim <= short, drifted(system, s, aim), s1)
     switches = way.switch.any()
     fails = ~switches & (theta < 1) & (aim > short)
-    s2, late = call_where(partial(behind, method, system, params), switches, (s1, jnp.zeros_like(h)), way.switch, h)
+    past = partial(past_switch, method, system, params)
+    s2, late = call_where(past, switches, (s1, jnp.zeros_like(h)), way.switch, aim <= short, h)
     start = tree_where(switches, s2, s)
     rest = jnp.where(switches, way.rest - aim - late, way.rest)
     aim = jnp.where(fails, theta * aim, rest)
@@ -146,10 +147,23 @@ def _part(method, system: FlatSystem, params: PyTree, s: State, h: Array):
         x = x - taken
     Gv = system.widened(answers[:, : system.positions]).T  # internal states do not jump
     slid = h * y(system.move(s.q, x / 2), x / h, s.t + h / 2)[m:]
-    for _ in range(CORRECTIONS):
+
+    def closing(x: Array, slid: Array) -> Array:
         open_by = gap(system.move(s.q, x), s1.t)
-        x = x - matvec(Gv, change(jnp.where(held, jnp.concatenate([open_by, slid]), 0)))
-        slid = jnp.zeros_like(slid)
+        return x - matvec(Gv, change(jnp.where(held, jnp.concatenate([open_by, slid]), 0)))
+
+    x = closing(x, slid)
+    for _ in range(CORRECTIONS - 1):
+        x = closing(x, jnp.zeros_like(slid))
+    of_gap, of_rate, of_force = _roundings(s1, J, K, f0 + df, h)
+
+    def open_at(x: Array) -> Array:
+        return jnp.any(jnp.where(closed, jnp.abs(gap(system.move(s.q, x), s1.t)) > CLOSED * of_gap, False))
+
+    def again(x: Array) -> Array:
+        return lax.fori_loop(0, MORE, lambda _, x: closing(x, jnp.zeros_like(slid)), x)
+
+    x = call_where(again, open_at(x), x)
     q = system.move(s.q, x)
     y1 = y(q, s1.v, s1.t)
     v = s1.v - matvec(Gv, change(jnp.where(held, y1, 0)))
@@ -160,16 +174,19 @@ def _part(method, system: FlatSystem, params: PyTree, s: State, h: Array):
     L = None if s1.L is None else s1.L + matvec(answers[:, size : size + n].T, more)
     s1 = system.tidy(s1._replace(q=q, v=v, w=w, a=a, L=L, contact=s.contact._replace(f=f1, code=jnp.zeros_like(h))))
 
-    gaps = tuple(jnp.where(closed, 0, gap(x.q, x.t)) for x in (s, s1))
-    ends = tuple(jnp.where(held, 0, x) for x in (y(s.q, s.v, s.t), y1))
-    course = Course(h, gaps, ends, (f0, f1), _roundings(s1, J, f1))
-    jams = jnp.any(closed & (presses(K, modes, mu) <= proximal(K.dtype) * jnp.abs(diagonal(K)[:m])))
-    info = info._replace(contact=jnp.maximum(s.contact.code, jnp.where(jams, JAMMED, FINE).astype(h.dtype)))
+    g0, g1, y0 = gap(s.q, s.t), gap(s1.q, s1.t), y(s.q, s.v, s.t)
+    gaps, ends = (jnp.where(closed, 0, g0), jnp.where(closed, 0, g1)), (jnp.where(held, 0, y0), jnp.where(held, 0, y1))
+    course = Course(h, gaps, ends, (f0, f1), (of_gap, of_rate, of_force))
+    jams = closed & (presses(K, modes, mu) <= proximal(K.dtype) * jnp.abs(diagonal(K)[:m]))
+    stays_open = closed & (jnp.abs(g1) > OPEN * of_gap)
+    code = jnp.where(jnp.any(jams), Fault.JAMMED, jnp.where(jnp.any(stays_open), Fault.OPEN, 0)).astype(h.dtype)
+    info = info._replace(contact=jnp.maximum(s.contact.code, code))
     return s1, info if B is None else report_constraints(method, system, params, h, s, s1, info, B), course
 
 
-def _roundings(s: State, J: Array, f: Array):
-    """What gaps, rates and forces may be beyond 0."""
+def _roundings(s: State, J: Array, K: Array, f: Array, h: Array):
+    """What gaps, rates and forces may be beyond 0: roundings of what they are made of, contact forces among it."""
     few, m = ROUNDING * float(jnp.finfo(f.dtype).eps), len(J) // 2
-    along = matvec(jnp.abs(J), jnp.abs(s.v))[m:]
-    return few * jnp.sum(jnp.abs(J[:m]), axis=1) * jnp.max(jnp.abs(s.q)), few * along, few * jnp.max(jnp.abs(f))
+    along, pushed = matvec(jnp.abs(J), jnp.abs(s.v))[m:], h * matvec(jnp.abs(K), jnp.abs(f))
+    of_gap = jnp.sum(jnp.abs(J[:m]), axis=1) * jnp.max(jnp.abs(s.q)) + h * pushed[:m]
+    return few * of_gap, few * (along + pushed[m:]), few * jnp.max(jnp.abs(f))

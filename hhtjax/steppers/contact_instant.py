@@ -25,7 +25,7 @@ from hhtjax.steppers.contact_modes import Modes, matrix, right_side
 from hhtjax.steppers.stepper import ContactState, State
 from hhtjax.steppers.variable_step import drifted
 from hhtjax.systems.constraints import answers, curvature
-from hhtjax.systems.contact import directions, rates, rates_of_rates, speeds
+from hhtjax.systems.contact import Fault, directions, rates, rates_of_rates, speeds
 from hhtjax.systems.contact_start import nearly_closed
 from hhtjax.systems.friction import across
 
@@ -38,7 +38,6 @@ NEAR = 1e-6  # the same of a gap that is closed
 SHORT = 1.0  # steps: a flight that is shorter does not begin
 LATE = 0.1  # part of a step, by which a landing or a stop may be corrected
 COUPLED = 1e-9  # of what a force does to its own contact, that it does to another
-FINE, NO_FORCES, JAMMED, SEVERAL = 0.0, 1.0, 3.0, 4.0  # codes of a step
 
 
 class Place(NamedTuple):
@@ -65,18 +64,18 @@ def begin_contact(method, system: FlatSystem, q: Array, v: Array, t: Array, para
     place, m = _place(method, system, q, t, params), system.contact.size
     w, _ = _free(system, place, q, v, t, params)
     fast, y = speeds(place.J, v, w, h), rates(system, q, v, t, params)
-    near = jnp.maximum(NEAR * h * fast, nearly_closed(q))
+    near = jnp.maximum(NEAR * h * fast, nearly_closed(system, q, place.J))
     down = (jnp.abs(system.contact.gap(q, t, params)) <= near) & (jnp.abs(y[:m]) <= _still(fast))
     sig = jnp.where(jnp.abs(y[m:]) > _still(fast), jnp.sign(y[m:]), 0)
     zero = jnp.zeros_like(fast)
-    s = State(
-        t, q, v, w, w, contact=ContactState(jnp.zeros_like(y), zero, sig, zero - jnp.inf, zero, jnp.zeros_like(t))
-    )
-    return _anew(system, place, s, down, sig, params)
+    unknown = ContactState(jnp.zeros_like(y), zero, sig, zero, zero - jnp.inf, zero, jnp.zeros_like(t))
+    return _anew(system, place, State(t, q, v, w, w, contact=unknown), down, sig, params)
 
 
-def behind(method, system: FlatSystem, params: PyTree, before: tuple, switch: Switch, h: Array):
-    """The state behind a switch, and by how much later that is than the state before. h: the whole step."""
+def past_switch(method, system: FlatSystem, params: PyTree, before: tuple, switch: Switch, at_once: Array, h: Array):
+    """The state behind a switch, and by how much later that is than the state before. at_once: whether it is at the
+    start of what is tried; what lands there without speed has let go only by an error of the step, and stays closed. h:
+    the whole step."""
     s, _ = before
     contact, m = system.contact, system.contact.size
     late = _late(system, params, s, switch, h)
@@ -88,6 +87,7 @@ def behind(method, system: FlatSystem, params: PyTree, before: tuple, switch: Sw
     meets = (contact.gap(q, t, params) <= NEAR * h * fast) & (y[:m] < -_still(fast))
     hits = ~closed & ((switch.lands > 0) | meets)
     counted = hits & (y[:m] < -_still(fast))
+    stays = hits & ~counted & at_once
     here = closed | hits
     coupled = jnp.abs(place.K[:m, :m]) > COUPLED * jnp.abs(diagonal(place.K)[:m, None])
     others = coupled & here[None, :] & ~jnp.eye(m, dtype=bool)
@@ -108,9 +108,9 @@ def behind(method, system: FlatSystem, params: PyTree, before: tuple, switch: Sw
     # what would still bounce, infinitely often, rests behind all that
     zeno = jnp.where(flies & down, 2 * y[:m] / jnp.where(down & flies, falling * (1 - e), 1), 0)
     since, impacts = jnp.where(closed, s.contact.since, t + zeno), s.contact.impacts + counted.astype(h.dtype)
-    code = jnp.where(several, SEVERAL, FINE).astype(h.dtype)
+    code = jnp.where(several, Fault.SEVERAL, 0).astype(h.dtype)
     known = s.contact._replace(since=since, impacts=impacts, code=code)
-    return _anew(system, place, s._replace(v=v, contact=known), down, slides, params), late
+    return _anew(system, place, s._replace(v=v, contact=known), down, slides, params, stays), late
 
 
 def jumped_contact(method, system: FlatSystem, s: State, params: PyTree, h: Array) -> State:
@@ -141,22 +141,23 @@ def _held(place: Place, held: Array, v: Array, y: Array) -> Array:
     return v + matvec(place.G.T, inverted(S)(jnp.where(held, -y, 0)))
 
 
-def _anew(system: FlatSystem, place: Place, s: State, down: Array, sig: Array, params: PyTree):
+def _anew(
+    system: FlatSystem, place: Place, s: State, down: Array, sig: Array, params: PyTree, stays: Array | None = None
+):
     """The state with the modes, forces and accelerations of contacts that are down. sig: the directions in which they
-    slide, 0 of those that do not."""
+    slide, 0 of those that do not. stays: (m,), which of them are closed whatever their force."""
     q, v, t, mu = s.q, s.v, s.t, system.contact.friction(params)
     w, L = _free(system, place, q, v, t, params)
     ydot = rates_of_rates(system, q, v, w, t, params)
     found = choice(place.K, ydot, mu, jnp.zeros_like(mu), down, jnp.where(down, sig, 0))
-    modes = Modes(found.pushes.astype(v.dtype), jnp.where(found.pushes, found.sig, 0))
+    closed = found.pushes if stays is None else found.pushes | (stays & down)
+    modes = Modes(closed.astype(v.dtype), jnp.where(closed, found.sig, 0))
     f = inverted(matrix(place.K, modes, mu))(right_side(ydot, jnp.zeros_like(ydot), modes, mu))
     w = w + matvec(place.G.T, f)
     L = None if L is None else L + matvec(place.pulls.T, f)
-    code = jnp.where(found.jams, JAMMED, jnp.where(found.found, FINE, NO_FORCES)).astype(v.dtype)
-    code = jnp.maximum(s.contact.code, code)
-    return s._replace(
-        v=v, w=w, a=w, L=L, contact=s.contact._replace(f=f, closed=modes.closed, sig=modes.sig, code=code)
-    )
+    code = jnp.where(found.jams, Fault.JAMMED, jnp.where(found.found, 0, Fault.NO_FORCES)).astype(v.dtype)
+    known = s.contact._replace(sticks=modes.which(mu)[1].astype(v.dtype), code=jnp.maximum(s.contact.code, code))
+    return s._replace(v=v, w=w, a=w, L=L, contact=known._replace(f=f, closed=modes.closed, sig=modes.sig))
 
 
 def _free(system: FlatSystem, place: Place, q: Array, v: Array, t: Array, params: PyTree):

@@ -62,6 +62,7 @@ class ContactState(NamedTuple):
         f: (2 m,), the forces: normal ones, positive where they push, then those along the surfaces.
         closed: (m,), 1 where bodies touch, else 0.
         sig: (m,), the direction in which a closed contact slides: -1, 1, or 0 where it sticks.
+        sticks: (m,), 1 where it is held by friction, else 0.
         since: (m,), since when a closed contact is that, -inf from the start on.
         impacts: (m,), how often bodies have met there.
         code: 0, or what went wrong where the modes were chosen, for the next step to tell.
@@ -70,6 +71,7 @@ class ContactState(NamedTuple):
     f: Array
     closed: Array
     sig: Array
+    sticks: Array
     since: Array
     impacts: Array
     code: Array

@@ -30,6 +30,12 @@ if TYPE_CHECKING:
 MOST = 4  # contacts
 
 
+class Fault:
+    """What may go wrong with contacts: the codes of steps and runs, as floats; 0 nothing."""
+
+    NO_FORCES, MANY, JAMMED, SEVERAL, OPEN, OVERLAP, APPROACH, RANGE = (float(k) for k in range(1, 9))
+
+
 @dataclass(frozen=True, eq=False)
 class Contact(Description):
     """Contacts of bodies in a plane, for `System(contact=)`: they rest, stick, slide and let go.
@@ -163,9 +169,10 @@ def _coefficient(caller: str, name: str, given: Any, m: int, dtype: Any, params:
         value = params[given]
     else:
         value: Any = given(params) if callable(given) and not is_array(given) else given
-    if jnp.shape(value) not in ((), (m,)):
+    value = jnp.asarray(value)
+    if value.shape not in ((), (m,)):
         raise ValueError(f"{caller}: `{name}` must be a number or have shape ({m},); received {describe(value)}.")
-    return jnp.broadcast_to(jnp.asarray(value).astype(dtype), (m,))
+    return jnp.broadcast_to(value.astype(dtype), (m,))
 
 
 def rates(system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) -> Array:

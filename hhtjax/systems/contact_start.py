@@ -9,16 +9,17 @@ import numpy as np
 
 from hhtjax.description import Array, PyTree, Real, known_now
 from hhtjax.numerics.dense_lu import matvec
-from hhtjax.systems.contact import directions, rates
+from hhtjax.systems import kinematics
+from hhtjax.systems.contact import Fault, directions, rates
 from hhtjax.systems.flat_system import flatten
 from hhtjax.xla import Programs
 
 if TYPE_CHECKING:
     from hhtjax.systems.flat_system import FlatSystem
 
-CLOSED = 1e-9  # of the size of q, as which a gap is 0
+CLOSED = 1e-9  # of the coordinates that it is made of, as which a gap is 0
 STILL = 1e-6  # of the velocities that a rate is made of, as which it is 0
-OVERLAPS, APPROACHES, RANGE = 1, 2, 3
+ROUNDING = 1e-12  # a gap that is always 0: what is known of its size may be 0
 
 
 def require_contact_start(
@@ -39,7 +40,7 @@ def require_contact_start(
     flaws = flaws.reshape(-1, flaws.shape[-1]).max(axis=0)
     for i in np.flatnonzero(flaws)[:1]:
         g, speed = (x.reshape(-1, x.shape[-1])[:, i] for x in (gap, rate))
-        if flaws[i] == OVERLAPS:
+        if flaws[i] == Fault.OVERLAP:
             raise ValueError(
                 f"{caller}: `q0` must keep bodies apart: the gap of contact {i} is {g.min():.6g}; expected 0 or more."
             )
@@ -66,15 +67,19 @@ def start_flaws(flat: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) 
     assert flat.contact is not None
     m = flat.contact.size
     gap, y = flat.contact.gap(q, t, params), rates(flat, q, v, t, params)[:m]
-    zero = nearly_closed(q)
-    fast = matvec(jnp.abs(directions(flat, q, t, params)[:m]), jnp.abs(v))
+    J = directions(flat, q, t, params)
+    zero, fast = nearly_closed(flat, q, J), matvec(jnp.abs(J[:m]), jnp.abs(v))
     still = max(STILL, 1e3 * float(jnp.finfo(v.dtype).eps)) * fast
     approaches = (gap <= zero) & (y < -still)
     mu, e = flat.contact.friction(params), flat.contact.restitution(params)
     in_range = (mu >= 0) & jnp.isfinite(mu) & (e >= 0) & (e <= 1)
-    return jnp.where(in_range, jnp.where(gap < -zero, OVERLAPS, jnp.where(approaches, APPROACHES, 0)), RANGE)
+    flaws = jnp.where(gap < -zero, Fault.OVERLAP, jnp.where(approaches, Fault.APPROACH, 0.0))
+    return jnp.where(in_range, flaws, Fault.RANGE).astype(q.dtype)
 
 
-def nearly_closed(q: Array) -> Array:
-    """The gap that counts as 0 at a start."""
-    return max(CLOSED, 1e3 * float(jnp.finfo(q.dtype).eps)) * (1 + jnp.max(jnp.abs(q)))
+def nearly_closed(flat: FlatSystem, q: Array, J: Array) -> Array:
+    """(m,): the gaps that count as 0 at a start, beside the coordinates that they are made of."""
+    few = float(jnp.finfo(q.dtype).eps) / float(jnp.finfo(jnp.float64).eps)
+    size = kinematics.sizes(flat.blocks, q)
+    gap_of = jnp.abs(J[: len(J) // 2, : size.shape[0]])
+    return min(few * CLOSED, 1e-4) * matvec(gap_of, size) + min(few * ROUNDING, 1e-6)
