@@ -1,10 +1,10 @@
 """Bodies that rest, stick, slide, let go and land: order, closed forms, derivatives, fits, gaps, cost, and other ways."""
 
-from experiments.contact import closed_forms, derivatives, limits, order
+from experiments.contact import closed_forms, cost, derivatives, films, limits, order, parameters, peers
 from experiments.parts import run_experiment
 from experiments.report import Report
 
-PARTS = closed_forms, order, derivatives, limits
+PARTS = films, closed_forms, order, peers, derivatives, parameters, limits, cost
 
 
 def run(report: Report, fast: bool):

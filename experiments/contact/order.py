@@ -49,8 +49,8 @@ def largest(found, exact):
 
 
 def slopes(steps, errors):
-    """Of lines through the logarithms from 160 steps on; None where errors are rounding."""
-    some = [i for i, n in enumerate(steps) if n >= min(160, steps[-1] // 4)]
+    """Of lines through the logarithms from 320 steps on; None where errors are rounding."""
+    some = [i for i, n in enumerate(steps) if n >= min(320, steps[-1] // 4)]
     x, y = np.log(np.asarray(steps)[some]), np.log(np.maximum(np.asarray(errors)[some], 1e-300))
     exact = np.max(np.asarray(errors)[some], axis=0) < 1e-11
     return [None if e else float(-np.polyfit(x, y[:, i], 1)[0]) for i, e in enumerate(exact)]
