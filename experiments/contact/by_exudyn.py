@@ -27,6 +27,6 @@ def rolled(mu, v0, inertia, duration, steps, stiffness=1e6, zone=1e-4):
     stepping = settings.timeIntegration
     stepping.numberOfSteps, stepping.endTime, stepping.verboseMode = steps, duration, 0
     stepping.generalizedAlpha.spectralRadius = 0.9
-    settings.solution.writeSolutionToFile = False
+    settings.solution.file.write = False
     system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
     return float(system.GetObjectOutputBody(body, exu.OutputVariableType.Velocity, [0, 0, 0])[1])

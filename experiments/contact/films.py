@@ -7,7 +7,7 @@ import numpy as np
 from experiments.cardona_geradin1989.animation import save
 from experiments.contact.scenes import SCENES, run_of, shaken
 from experiments.report import COLOURS
-from hhtjax.plot import subplots
+from hhtjax.plot import LINES, subplots
 
 FRAMES, PER_SECOND = 60, 20
 
@@ -54,8 +54,7 @@ LIMITS = {"rock": ((-0.6, 0.8), (-0.1, 2.2)), "hopper": ((-0.8, 0.8), (-0.1, 1.6
 
 def film(report, name, path: Any):
     """NAME's motion, slowed down to three seconds; closed contacts are told in the title."""
-    drawn, axes = subplots(width=70, height=70)
-    drawn.set_dpi(90)
+    drawn, axes = subplots(width=52, height=58)
     axes.set(xlim=LIMITS[name][0], ylim=LIMITS[name][1], aspect="equal")
     axes.grid(False)
     axes.axhline(0, color="black", lw=1)
@@ -69,31 +68,35 @@ def film(report, name, path: Any):
         says = ["sticks" if s and name != "hopper" else "touches" if c else "open" for c, s in zip(closed[i], sticking[i], strict=True)]
         axes.set_title(f"t = {t[i]:.2f} s: {', '.join(says)}")
 
+    drawn.canvas.draw()
+    drawn.set_layout_engine("none")  # which would be solved anew for each frame
     save(report, f"contact_{name}", drawn, draw, len(q), PER_SECOND)
 
 
 def strips(report, paths):
     """Some instants of each scene on one another, dark at the end."""
-    drawn, axes = subplots(1, len(paths), width=180, height=65)
+    ratios = {"width_ratios": [1.5, 1.6, 0.8, 1.2, 0.8]}
+    drawn, axes = subplots(1, len(paths), width=180, height=62, gridspec_kw=ratios)
     for panel, (name, run) in zip(axes, paths.items(), strict=True):
-        q = np.asarray(run.q)
-        some = np.linspace(0, len(q) - 1, 25 if name == "ball" else 7).round().astype(int)
+        q, t = np.asarray(run.q), np.asarray(run.t)
+        panel.axhline(0, color="black", lw=0.8)
+        panel.set_title(name)
+        panel.locator_params(axis="x", nbins=3)
+        if name == "hopper":
+            for i, body in enumerate(("upper", "lower")):
+                panel.plot(t, q[:, i], color=COLOURS[i], ls=LINES[i])
+                panel.text(0.05, (0.95, 0.05)[i], body, color=COLOURS[i])
+            panel.set(xlabel="time (s)")
+            continue
+        last = len(q) // 2 if name == "rod" else len(q) - 1
+        some = np.linspace(0, last, 25 if name == "ball" else 7).round().astype(int)
         for k, i in enumerate(some):
             for line in lines_of(name, q[i]):
                 panel.plot(*line.T, color=COLOURS[0], alpha=0.2 + 0.8 * k / len(some), lw=1)
         if name == "ball":
             panel.plot(q[:, 0], q[:, 1] + 0.05, color=COLOURS[7], lw=0.6)
-        if name == "hopper":
-            panel.cla()
-            panel.plot(run.t, q[:, 0], label="upper", color=COLOURS[0])
-            panel.plot(run.t, q[:, 1], label="lower", color=COLOURS[1], ls="--")
-            panel.set(xlabel="time (s)")
-            panel.legend(loc="center right")
-        else:
-            panel.set_aspect("equal")
-            panel.set(xlabel="x (m)")
-        panel.axhline(0, color="black", lw=0.8)
-        panel.set_title(name)
+        panel.set_aspect("equal")
+        panel.set(xlabel="x (m)")
     axes[0].set_ylabel("y (m)")
     report.figure("contact_scenes", drawn)
 
@@ -105,6 +108,6 @@ def run(report, fast):
     if not fast:
         for name in LIMITS:
             film(report, name, paths[name])
-        paths["stack, 2.4 mu g"] = run_of(shaken(2.4), 40 * FRAMES, 40)
+        paths["stack"] = run_of(shaken(2.4), 40 * FRAMES, 40)
         strips(report, paths)
     return {"frames": FRAMES, "failed": [int(run.failure.step) for run in paths.values()]}

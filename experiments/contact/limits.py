@@ -10,19 +10,17 @@ from experiments.contact.scenes import SCENES, ball, disc, energy, rock, rod, sh
 STEPS = 40, 160, 640, 2560
 
 
-def all_scenes():
-    """Those of the page."""
-    more = {"disc": disc(), "slope": slope(0.5, -2.0), "stack": stack(0.0)}
-    return SCENES | more | {f"stack, {part:g} mu g": shaken(part) for part in (0.65, 2.4)}
-
-
-FREE = {"ball without drag": ball(0.0), "rod": rod(), "rock": rock(), "disc": disc(), "slope": slope(0.3, -2.0)}
+ALL = SCENES | {
+    "disc": disc(), "slope": slope(0.5, -2.0), "stack": stack(0.0),
+    **{f"stack, {part:g} mu g": shaken(part) for part in (0.65, 2.4)},
+}  # fmt: skip
+FREE = {"ball without drag": ball(0.0), "rod": rod(), "rock": rock(), "disc": disc(), "slope, stays": slope(0.3, -2.0)}
 
 
 @partial(jax.jit, static_argnames=("name", "longest"))
 def gaps_and_energy(name, dt, longest):
     """Of one program for all step sizes, whose further steps are unused; and the step that failed."""
-    scene = (all_scenes() | FREE)[name]
+    scene = (ALL | FREE)[name]
     run = simulate(scene, dt, longest)
     gap = jax.vmap(lambda q, t: jnp.min(scene.contact.gap(q, t, scene.params)))(run.q, run.t)
     return gap, None if scene.potential is None else energy(scene, run), run.failure.step
@@ -31,7 +29,7 @@ def gaps_and_energy(name, dt, longest):
 def run(report, fast):
     """For each scene and number of steps; the smoke run has one scene."""
     gaps, rises, sizes = [], [], STEPS[:1] if fast else STEPS
-    for name, scene in list((all_scenes() | FREE).items())[: 1 if fast else None]:
+    for name, scene in list((ALL | FREE).items())[: 1 if fast else None]:
         for n in sizes:
             gap, e, failed = gaps_and_energy(name, scene.T / n, sizes[-1])
             named = int(failed) if int(failed) <= n else 0

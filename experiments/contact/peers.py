@@ -15,8 +15,7 @@ OURS = (160, 640, 2560)
 SIZES = (160, 640, 2560, 10240, 40960, 163840)  # of MuJoCo
 SETTINGS = {"default": None, "stiffest": 0.9999}
 ANGLE, CREEP = 0.37, 10.0  # rad, s
-DISC = (100, 1000, 10000)
-ZONES = (1e-3, 1e-4)  # m/s
+DISC = (100, 300, 1000, 3000, 10000)
 
 
 def model_of(body, dt, impedance, gravity, mu):
@@ -85,13 +84,17 @@ def in_mujoco(report, exact, sizes):
 
 
 def in_exudyn(sizes):
-    """Errors of the speed with which a disc rolls."""
-    p = disc().params
-    return [
-        {"zone_m_s": zone, "steps": n, "error_v": abs(by_exudyn.rolled(p["mu"], p["v0"], 0.5, 1.0, n, zone=zone) - 4 / 3)}
-        for zone in ZONES
-        for n in sizes
-    ]
+    """Errors of the speed with which a disc rolls; None where exudyn's solver ends."""
+    p, rows = disc().params, []
+    for n in sizes:
+        try:
+            error = abs(by_exudyn.rolled(p["mu"], p["v0"], 0.5, 1.0, n) - 4 / 3)
+        except Exception as problem:  # exudyn's own kind of it
+            if type(problem).__name__ != "SolverError":
+                raise
+            error = None
+        rows.append({"steps": n, "error_v": error})
+    return rows
 
 
 def run(report, fast):

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import hhtjax
 
@@ -95,7 +96,7 @@ def disc(inertia=0.5) -> Scene:
 
 def slope(angle, v0) -> Scene:
     """A block on a slope that falls to the right, in space coordinates, which starts with the speed v0 down it."""
-    s, c = float(jnp.sin(angle)), float(jnp.cos(angle))
+    s, c = float(np.sin(angle)), float(np.cos(angle))
     plane = hhtjax.Contact(
         gap=lambda q, t, params: s * q[0] + c * q[1],
         sliding=lambda q, v, t, params: c * v[0] - s * v[1],

@@ -1,0 +1,246 @@
+"""README.md beside this file, made from page.md and contact.json.
+
+`python -m experiments.contact.page`
+"""
+
+import json
+from pathlib import Path
+
+from experiments.contact.order import IMPULSES, OURS, SPRINGS
+from experiments.contact.other_ways import SWEEPS
+from experiments.page import table
+
+HERE = Path(__file__).parent
+
+
+def small(x, digits=1):
+    """A number, or what there is instead."""
+    return "not finite" if x is None else f"{x:.{digits}e}"
+
+
+def times(x):
+    """A ratio."""
+    return f"{x:.2g}"
+
+
+def machine(made_by):
+    """In a few words."""
+    made = made_by if "cores" in made_by else next(iter(made_by["parts"].values()))
+    return f"{made['cores']} cores ({made['processor']}), jax {made['jax']}"
+
+
+def slopes_of(rows):
+    """(scene, alpha, kind, slope) of those that are no rounding."""
+    return [(r["scene"], r["alpha"], kind, x) for r in rows for kind, x in r["slopes"].items() if x is not None]
+
+
+def worst(values):
+    """The largest, None (not finite) being the worst."""
+    return None if any(x is None for x in values) else max(values)
+
+
+def bars_table(numbers):
+    """What was asked for, what was measured, and whether it holds."""
+    slopes, cost = slopes_of(numbers["order"]["rows"]), numbers["cost"]["rows"]
+    values = [x for *_, x in slopes]
+    inside = sum(1.85 <= x <= 2.15 for x in values)
+    closed, derivatives = numbers["closed_forms"], numbers["derivatives"]["rows"]
+    forms, stack = closed["slopes"] + closed["rolling"], closed["stack"]
+    gaps = numbers["limits"]["gaps"]
+    lowest = min(row["lowest_gap_m"] for row in gaps if not row["failed_step"])
+    reverse = worst([x for row in derivatives for x in row["forward_minus_reverse"]])
+    central = worst([x for row in derivatives for x in row["difference_from_central"]])
+    ratio = {what: x["ratio_of_times"] for what, x in cost.items()}
+    rows = [
+        ["order of q, v and forces, 5 scenes, alpha 0, -0.05, -0.3", "1.85 to 2.15", f"{min(values):.2f} to {max(values):.2f}, {inside} of {len(values)} inside", inside == len(values)],
+        ["slope, disc, sphere: formula, 40 steps", "1e-10", small(worst([x["error_m"] for x in forms])), worst([x["error_m"] for x in forms]) <= 1e-10],
+        ["their derivatives", "1e-9", small(worst([x["derivative_error"] for x in forms])), worst([x["derivative_error"] for x in forms]) <= 1e-9],
+        ["lowest gap (m)", ">= -1e-12", small(lowest), lowest >= -1e-12],
+        ["stack at rest has moved (m)", "1e-15", small(stack["moved_m"]), stack["moved_m"] <= 1e-15],
+        ["its forces (N)", "1e-12", small(stack["force_error_N"]), stack["force_error_N"] <= 1e-12],
+        ["derivatives - central differences, relative", "1e-8", small(central), central is not None and central <= 1e-8],
+        ["reverse - forward, relative", "1e-12", small(reverse), reverse is not None and reverse <= 1e-12],
+        ["step without a switch, over plain", "5", times(ratio["step"]), ratio["step"] <= 5],
+        ["compilation (s, CPU)", "8", f"{cost['step']['compile_time_s'][0]:.1f}", cost["step"]["compile_time_s"][0] <= 8],
+        ["forward mode, over plain", "20", times(ratio["forward"]), ratio["forward"] <= 20],
+        ["batch of 64, over its plain batch", "1.5", times(ratio["batch"]), ratio["batch"] <= 1.5],
+    ]  # fmt: skip
+    return table(["", "bar", "measured", "holds"], [[*row[:3], "yes" if row[3] else "**no**"] for row in rows])
+
+
+def orders_table(rows):
+    """Slopes and errors at two sizes."""
+    lines = []
+    for row in rows:
+        at = [row["error_q"][row["steps"].index(n)] for n in (160, 2560)]
+        slopes = ["exact" if x is None else f"{x:.2f}" for x in row["slopes"].values()]
+        lines.append([row["scene"], row["alpha"], *slopes, *map(small, at)])
+    header = ["", "alpha", "slope of q", "v", "forces", "error of q, 160 steps", "2560 steps"]
+    return table(header, lines)
+
+
+def closed_table(closed):
+    """Errors of what has a formula."""
+    rows = [[x["what"], small(x["error_m"]), small(x["derivative_error"])] for x in closed["slopes"]]
+    for x in closed["rolling"]:
+        what = f"{x['what']}, loses {x['lost']:.10f} of its speed ({x['formula']:.10f})"
+        rows.append([what, small(x["error_m"]), small(x["derivative_error"])])
+    return table(["", "error (m, m/s)", "of derivatives"], rows)
+
+
+def stack_words(stack):
+    """What three boxes do."""
+    stuck = ", ".join(f"{small(stack[f'stuck_error_m_{n}'])} m ({n} steps)" for n in (200, 1000))
+    return (
+        f"Three boxes on each other move {small(stack['moved_m'])} m in {stack['rest_s']:g} s, and their normal forces are "
+        f"off by {small(stack['force_error_N'])} N at most. On a floor that shakes with 0.65 mu g they stick, {stuck} from A sin(W t); with "
+        f"2.4 mu g they slip, and with 200 steps gaps stay below {small(stack['slipping_gap_m'])} m"
+        + (f" (step {stack['slipping_named_step']} is named as a failure)." if stack["slipping_named_step"] else ".")
+    )
+
+
+def ways_table(rows):
+    """Errors and times at some sizes."""
+    lines = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        for steps in dict.fromkeys(row["steps"] for row in rows):
+            by = {row["way"]: row for row in rows if (row["scene"], row["steps"]) == (scene, steps)}
+            entries = [by.get(way) for way in (OURS, IMPULSES, *SPRINGS)]
+            cells = ["" if x is None else f"{small(x['error_q'])} ({1e3 * x['time_s']:.2g} ms)" for x in entries]
+            lines.append([scene, steps, *cells])
+    return table(["", "steps", OURS, "impulses", *SPRINGS], lines)
+
+
+def springs_win(rows):
+    """Where springs reach 2 mm in less time than the fewest steps with contacts."""
+    lines = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        enough = [r for r in rows if r["scene"] == scene and r["error_q"] is not None and r["error_q"] <= 2e-3]
+        ours = min((r["time_s"] for r in enough if r["way"] == OURS), default=None)
+        soft = min((r["time_s"] for r in enough if r["way"] in SPRINGS), default=None)
+        if soft is None:
+            lines.append(f"{scene}: springs never get to 2 mm, contacts in {1e3 * ours:.2f} ms")
+        else:
+            lines.append(f"{scene}: springs get to 2 mm in {1e3 * soft:.2f} ms, contacts in {1e3 * ours:.2f} ms")
+    return "; ".join(lines)
+
+
+def mujoco_table(peers):
+    """Errors of the block."""
+    if "mujoco" not in peers:
+        return "MuJoCo was not installed."
+    rows = [["Contact", x["steps"], small(x["error_q"]), ""] for x in peers["ours"]["rock"]]
+    for x in peers["mujoco"]["rock"]:
+        rows.append([f"MuJoCo, {x['setting']}", x["steps"], small(x["error_q"]), f"{1e3 * x['time_s']:.3g}"])
+    return table(["", "steps", "error of q", "ms"], rows)
+
+
+def creep_words(peers):
+    """Of the slope."""
+    words = [f"{small(peers['ours']['creep_m_s'])} m/s with `Contact`"]
+    words += [f"{small(x)} m/s in MuJoCo ({name})" for name, x in peers.get("mujoco", {"creep_m_s": {}})["creep_m_s"].items()]
+    return ", ".join(words)
+
+
+def exudyn_words(peers):
+    """Of the disc."""
+    if "exudyn" not in peers:
+        return "exudyn was not installed."
+    rows = [f"{small(x['error_v'])} ({x['steps']})" for x in peers["exudyn"]["disc"]]
+    return f"exudyn's rolling disc with a spring of 1e6 N/m ends at 2/3 of its speed but for (m/s, of steps): {', '.join(rows)}."
+
+
+def derivatives_table(rows):
+    """Forward against reverse, differences, and the motion."""
+    lines = []
+    for row in rows:
+        motion = row["forward"][-1] if row["of_DOP853"] is None else row["of_DOP853"]
+        errors = [abs(x / motion - 1) if x is not None else None for x in (row["forward"][2], row["impulses"][-1], row["springs"][-1])]
+        pairs = (worst(row[key]) for key in ("forward_minus_reverse", "difference_from_central"))
+        lines.append([f"{row['scene']}, {row['parameter']}", f"{motion:.5g}", *map(small, pairs), *map(small, errors)])
+    return table(["", "of the motion", "- reverse", "- differences", "Contact", "impulses", "springs"], lines)
+
+
+def coverage_table(fit):
+    """How many intervals hold the truth."""
+    kinds = fit["covered"]
+    rows = []
+    for name, truth in fit["truth"].items():
+        value, low, high = fit["over_truth_with_interval"][name]
+        half = sorted((b - a) / 2 for a, b in zip(low, high, strict=True))[len(low) // 2]
+        rows.append([name, f"{truth:g}", *(f"{by[name]} of {fit['records']}" for by in kinds.values()), f"{100 * half:.2g} %"])
+    return table(["", "truth", *kinds, "half an interval, median"], rows)
+
+
+def energy_table(rows):
+    """Of free motions."""
+    lines = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        mine = [row for row in rows if row["scene"] == scene]
+        cells = [small(row["largest_rise_J"]) if row["largest_rise_J"] > 0 else "0" for row in mine]
+        lines.append([scene, f"{mine[-1]['lost_J']:.3g}", *cells])
+    steps = dict.fromkeys(row["steps"] for row in rows)
+    return table(["", "lost in all (J)", *(f"largest rise in a step (J), {n} steps" for n in steps)], lines)
+
+
+def cost_table(cost):
+    """Ratios."""
+    names = {
+        "step": "a step", "forward": "forward mode, one direction", "reverse": "reverse mode", "batch": f"a batch of {cost['members']}",
+    }  # fmt: skip
+    sizes = {"step": cost["steps"]}
+    rows = []
+    for what, name in names.items():
+        x = cost["rows"][what]
+        per = f"{1e9 * x['plain_time_s'] / sizes[what]:.0f} ns" if what in sizes else f"{1e3 * x['plain_time_s']:.3g} ms"
+        rows.append([name, per, times(x["ratio_of_times"]), f"{x['compile_time_plain_s'][0]:.1f}", f"{x['compile_time_s'][0]:.1f}"])
+    return table(["", "plain", "with contacts, times as long", "compile, plain (CPU s)", "with contacts"], rows)
+
+
+def page(numbers):
+    """The text of README.md."""
+    order, peers, fit, limits = (numbers[part] for part in ("order", "peers", "parameters", "limits"))
+    springs = [row for row in order["ways"] if row["way"] in SPRINGS]
+    wrong = [row for row in springs if row["error_q"] is None or row["error_q"] > 0.1]
+    failed = [row for row in limits["gaps"] if row["failed_step"]]
+    checks = (
+        f"{name}: {', '.join(map(small, x['deviation_of_reference_from_DOP853']))}" for name, x in order["references"].items()
+    )
+    return (
+        (HERE / "page.md")
+        .read_text()
+        .format(
+            machine=machine(numbers["made_by"]),
+            sweeps=SWEEPS,
+            bars=bars_table(numbers),
+            samples=order["samples"],
+            reference_steps=order["reference_steps"],
+            checks="; ".join(checks),
+            orders=orders_table(order["rows"]),
+            closed_steps=numbers["closed_forms"]["steps"],
+            closed=closed_table(numbers["closed_forms"]),
+            stack=stack_words(numbers["closed_forms"]["stack"]),
+            ways=ways_table(order["ways"]),
+            springs_wrong=f"{len(wrong)} of {len(springs)}",
+            springs_named=sum(row["named"] for row in wrong) or "none",
+            springs_win=springs_win(order["ways"]),
+            mujoco=mujoco_table(peers),
+            creep=creep_words(peers),
+            exudyn=exudyn_words(peers),
+            derivatives=derivatives_table(numbers["derivatives"]["rows"]),
+            fit_samples=fit["samples"],
+            fit_steps=" and ".join(map(str, fit["steps"])),
+            records=fit["records"],
+            converged=fit["converged"],
+            coverage=coverage_table(fit),
+            lowest_gap=min(row["lowest_gap_m"] for row in limits["gaps"]),
+            gap_failed=f"{len(failed)} of the runs end in a named failure" if failed else "no run fails",
+            energy=energy_table(limits["energy"]),
+            cost=cost_table(numbers["cost"]),
+            ball_us=", ".join(f"{x:.2g} us a step with {n} steps" for n, x in numbers["cost"]["rows"]["switches_time"].items()),
+        )
+    )
+
+
+if __name__ == "__main__":
+    (HERE / "README.md").write_text(page(json.loads((HERE / "contact.json").read_text())))
