@@ -1,4 +1,4 @@
-"""Against formulas, with 40 steps: a block on a slope, disc and sphere that come to roll, a stack at rest and shaken."""
+"""Against formulas, with 40 steps: a block on a slope, a disc and a sphere that come to roll, a stack of boxes."""
 
 import jax
 import jax.numpy as jnp
@@ -99,7 +99,9 @@ def stacks(report, fast):
         found[f"stuck_error_m_{steps}"] = float(jnp.max(jnp.abs(run.q[:, :3] - wanted)))
         found[f"stuck_all_the_time_{steps}"] = bool(run.contact.sticking.all())
     run = run_of(shaken(2.4), 200)
-    found["slipping_gap_m"] = float(jnp.max(jnp.abs(jnp.diff(run.q[:, 3:], axis=1, prepend=0.0) - jnp.array([0, 1, 1]))))
+    found["slipping_gap_m"] = float(
+        jnp.max(jnp.abs(jnp.diff(run.q[:, 3:], axis=1, prepend=0.0) - jnp.array([0, 1, 1])))
+    )
     found["slipping_named_step"] = int(run.failure.step)
     report.progress(f"stacks: {found}")
     return found
@@ -107,4 +109,9 @@ def stacks(report, fast):
 
 def run(report, fast):
     """All of them; the smoke run leaves out the slopes."""
-    return {"steps": STEPS, "slopes": [] if fast else slopes(report), "rolling": rolling(report), "stack": stacks(report, fast)}
+    return {
+        "steps": STEPS,
+        "slopes": [] if fast else slopes(report),
+        "rolling": rolling(report),
+        "stack": stacks(report, fast),
+    }

@@ -1,4 +1,4 @@
-"""Bodies that rest, stick, slide, let go and land: order, closed forms, derivatives, fits, gaps, cost, and other ways."""
+"""Contacts that rest, stick, slide, let go and land: order, formulas, derivatives, fits, gaps, cost, other ways."""
 
 from experiments.contact import closed_forms, cost, derivatives, films, limits, order, parameters, peers
 from experiments.parts import run_experiment

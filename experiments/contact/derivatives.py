@@ -59,7 +59,7 @@ def of_motion(name, parameter, i, part):
 
 def row_of(report, case, sizes):
     """One case, all step sizes."""
-    name, parameter, i, part = CASES[case]
+    name, parameter, _, part = CASES[case]
     scene, longest = SCENES[name], sizes[-1]
     x = jnp.asarray(scene.params[parameter])
     row = {"scene": name, "parameter": parameter, "steps": list(sizes), "of_DOP853": of_motion(*CASES[case])}

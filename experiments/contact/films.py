@@ -65,7 +65,10 @@ def film(report, name, path: Any):
     def draw(i):
         for line, x in zip(bodies, lines_of(name, q[i]), strict=True):
             line.set_data(*x.T)
-        says = ["sticks" if s and name != "hopper" else "touches" if c else "open" for c, s in zip(closed[i], sticking[i], strict=True)]
+        says = [
+            "sticks" if s and name != "hopper" else "touches" if c else "open"
+            for c, s in zip(closed[i], sticking[i], strict=True)
+        ]
         axes.set_title(f"t = {t[i]:.2f} s: {', '.join(says)}")
 
     drawn.canvas.draw()

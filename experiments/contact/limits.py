@@ -37,7 +37,11 @@ def run(report, fast):
             gaps.append(row | {"lowest_gap_m": float(jnp.min(gap[: n + 1])), "failed_step": named})
             if name in FREE:
                 e = e[: n + 1]
-                numbers = {"lost_J": e[0] - e[-1], "largest_rise_J": jnp.max(jnp.diff(e)), "above_start_J": jnp.max(e) - e[0]}
+                numbers = {
+                    "lost_J": e[0] - e[-1],
+                    "largest_rise_J": jnp.max(jnp.diff(e)),
+                    "above_start_J": jnp.max(e) - e[0],
+                }
                 rises.append(row | {key: float(x) for key, x in numbers.items()})
         report.progress(f"{gaps[-1]} {rises[-1] if rises and rises[-1]['scene'] == name else ''}")
     return {"gaps": gaps, "energy": rises}

@@ -36,7 +36,9 @@ def rates(scene, q, v, t, params):
 
 def coefficients(scene, params):
     """mu and e."""
-    return [params.get(x, 0.0) if isinstance(x, str) else x for x in (scene.contact.friction, scene.contact.restitution)]
+    return [
+        params.get(x, 0.0) if isinstance(x, str) else x for x in (scene.contact.friction, scene.contact.restitution)
+    ]
 
 
 def impulses(W, y, active, mu, bounce):
@@ -114,6 +116,4 @@ def by_springs(scene, stiffness, dt, steps, every=1, params=None):
     """A run of it, as `hhtjax.hht()` does it."""
     params = scene.params if params is None else params
     system, _ = compliant(scene, stiffness)
-    return hhtjax.simulate(
-        system, hhtjax.hht(), *scene.start(params), params, dt=dt, num_steps=steps, save_every=every
-    )
+    return hhtjax.simulate(system, hhtjax.hht(), *scene.start(params), params, dt=dt, num_steps=steps, save_every=every)

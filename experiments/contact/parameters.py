@@ -58,7 +58,8 @@ def run(report, fast):
     off = {key: jnp.log(guess / truth[key]) for key, guess in guesses.items()}
     found = judge(*fits, off) | {
         "truth": truth, "noise_m": deviation.tolist(), "samples": SAMPLES, "steps": [SAMPLES * n for n in STEPS],
-        "iterations": int(jnp.max(fits[1].iterations)), "cost_per_residual": float(jnp.median(fits[1].cost)) / exact.size,
+        "iterations": int(jnp.max(fits[1].iterations)),
+        "cost_per_residual": float(jnp.median(fits[1].cost)) / exact.size,
     }  # fmt: skip
     tell(report, found)
     first = {key: guesses[key][0] * float(jnp.exp(fits[1].params[key][0])) for key in FITTED}
@@ -81,7 +82,9 @@ def figure(report, measured, first, guess, found):
     for i, (name, numbers) in enumerate(found["over_truth_with_interval"].items()):
         value, low, high = (100 * (np.asarray(x) - 1) for x in numbers)
         place = np.arange(len(value)) + 0.3 * i
-        axes[2].errorbar(place, value, (value - low, high - value), fmt="os"[i], ms=2, lw=0.8, color=COLOURS[i], label=name)
+        axes[2].errorbar(
+            place, value, (value - low, high - value), fmt="os"[i], ms=2, lw=0.8, color=COLOURS[i], label=name
+        )
     axes[2].axhline(0, color="black", lw=0.8)
     axes[2].set(xlabel="record", ylabel="estimate against truth (%)")
     for panel in axes[1:]:

@@ -80,7 +80,11 @@ def table(scene, times, amplitude=0.05, frequency=12.0, **changed):
     def piece(sig):
         if sig == 0:
             guards = [(lambda t, y, s=s: mu * normal(t) - s * needed(t, y), -1) for s in (1, -1)]
-            return (lambda t, y: [under(t), -speed * frequency * np.sin(frequency * t)]), guards, lambda i, t, y: (np.array([y[0], under(t)]), (-1, 1)[i])
+            return (
+                (lambda t, y: [under(t), -speed * frequency * np.sin(frequency * t)]),
+                guards,
+                lambda i, t, y: (np.array([y[0], under(t)]), (-1, 1)[i]),
+            )
 
         def stop(i, t, y):
             y = np.array([y[0], under(t)])

@@ -2,8 +2,8 @@
 
 located: the same force, with a mode in params that an event switches at the beginning and at the end of a contact,
 graded by the motion of the force. impact: an event with a reset, which the stiff force stands for, graded by the motion
-of a rigid stop, solved from impact to impact. contact: `hhtjax.Contact` in the place of the force, for the `hht` family,
-with one restitution, that of the first impact; graded as impacts are.
+of a rigid stop, solved from impact to impact. contact: `hhtjax.Contact` in the place of the force, for `hht`, with one
+restitution, that of the first impact; graded as impacts are.
 """
 
 from typing import Any, NamedTuple
@@ -79,7 +79,9 @@ def with_stop(stop, way, case):
 
     if way == "contact":
         speed = float(np.sqrt(case.scene.v0[0] ** 2 + 2 * fall(stop, case)))
-        floor = hhtjax.Contact(gap=lambda q, t, params: q[0] - stop.wall, restitution=float(stop.rebound(speed)) / speed)
+        floor = hhtjax.Contact(
+            gap=lambda q, t, params: q[0] - stop.wall, restitution=float(stop.rebound(speed)) / speed
+        )
         return hhtjax.System(jnp.ones(1), lambda q, v, t, params: stop.free(q), contact=floor), case.scene.params, None
     located = hhtjax.Event(before, switch=lambda params: params | {"on": 1 - params["on"]})
     event = located if way == "located" else hhtjax.Event(before, reset=reset)
