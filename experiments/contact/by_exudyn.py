@@ -1,5 +1,7 @@
 """The disc in exudyn: a rolling disc with a stiff spring below it, and friction that is linear below a speed."""
 
+from typing import Any
+
 import numpy as np
 
 from experiments.contact.scenes import GRAVITY
@@ -10,9 +12,10 @@ def rolled(mu, v0, inertia, duration, steps, stiffness=1e6, zone=1e-4):
     import exudyn as exu  # pyright: ignore[reportMissingImports]  # of an extra of its own
     from exudyn.utilities import RigidBodyInertia  # pyright: ignore[reportMissingImports]
 
-    system = exu.SystemContainer().AddSystem()
+    system: Any = exu.SystemContainer().AddSystem()
     ground = system.CreateGround()
-    of_body = RigidBodyInertia(mass=1.0, inertiaTensor=np.diag([inertia, inertia, inertia]))
+    kind: Any = RigidBodyInertia
+    of_body = kind(mass=1.0, inertiaTensor=np.diag([inertia, inertia, inertia]))
     sinks = GRAVITY / stiffness
     body = system.CreateRigidBody(
         inertia=of_body, referencePosition=[0, 0, 1 - sinks], initialVelocity=[0, v0, 0], gravity=[0, 0, -GRAVITY]

@@ -79,7 +79,7 @@ def orders(report, name, exact, steps):
 def ways(scene, steps):
     """{way: program}, which give q and v at the samples."""
     dt, every = scene.T / steps, steps // SAMPLES
-    found = {IMPULSES: lambda params: by_impulses(scene, dt, steps, every, params)[:2]}
+    found: dict = {IMPULSES: lambda params: by_impulses(scene, dt, steps, every, params)[:2]}
     for way, k in zip(SPRINGS, STIFFNESSES, strict=True):
 
         def soft(params, k=k):

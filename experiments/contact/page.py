@@ -4,6 +4,7 @@
 """
 
 import json
+import math
 from pathlib import Path
 
 from experiments.contact.order import IMPULSES, OURS, SPRINGS
@@ -15,7 +16,7 @@ HERE = Path(__file__).parent
 
 def small(x, digits=1):
     """A number, or what there is instead."""
-    return "not finite" if x is None else f"{x:.{digits}e}"
+    return "not finite" if x is None or math.isinf(x) else f"{x:.{digits}e}"
 
 
 def times(x):
@@ -35,8 +36,8 @@ def slopes_of(rows):
 
 
 def worst(values):
-    """The largest, None (not finite) being the worst."""
-    return None if any(x is None for x in values) else max(values)
+    """The largest; infinite where one is not finite."""
+    return max(math.inf if x is None else x for x in values)
 
 
 def bars_table(numbers):
@@ -61,8 +62,8 @@ def bars_table(numbers):
         ["lowest gap (m)", ">= -1e-12", small(lowest), lowest >= -1e-12],
         ["stack at rest has moved (m)", "1e-15", small(stack["moved_m"]), stack["moved_m"] <= 1e-15],
         ["its forces (N)", "1e-12", small(stack["force_error_N"]), stack["force_error_N"] <= 1e-12],
-        ["derivatives - central differences, relative", "1e-8", small(central), (central or 1) <= 1e-8],
-        ["reverse - forward, relative", "1e-12", small(reverse), reverse is not None and reverse <= 1e-12],
+        ["derivatives - central differences, relative", "1e-8", small(central), central <= 1e-8],
+        ["reverse - forward, relative", "1e-12", small(reverse), reverse <= 1e-12],
         ["step without a switch, over plain", "5", times(ratio["step"]), ratio["step"] <= 5],
         ["compilation (s, CPU)", "8", f"{compiling:.1f}", compiling <= 8],
         ["forward mode, over plain", "20", times(ratio["forward"]), ratio["forward"] <= 20],
@@ -94,11 +95,12 @@ def closed_table(closed):
 def stack_words(stack):
     """What three boxes do."""
     stuck = ", ".join(f"{small(stack[f'stuck_error_m_{n}'])} m ({n} steps)" for n in (200, 1000))
+    gap, named = small(stack["slipping_gap_m"]), stack["slipping_named_step"]
     return (
-        f"Three boxes on each other move {small(stack['moved_m'])} m in {stack['rest_s']:g} s, and their normal forces "
-        f"are off by {small(stack['force_error_N'])} N at most. On a floor that shakes with 0.65 mu g they stick, {stuck} "
-        f"from A sin(W t); with 2.4 mu g they slip, and with 200 steps gaps stay below {small(stack['slipping_gap_m'])} m"
-        + (f" (step {stack['slipping_named_step']} is named as a failure)." if stack["slipping_named_step"] else ".")
+        f"Three boxes on each other move {small(stack['moved_m'])} m in {stack['rest_s']:g} s, and their normal "
+        f"forces are off by {small(stack['force_error_N'])} N at most. On a floor that shakes with 0.65 mu g they "
+        f"stick, {stuck} from A sin(W t); with 2.4 mu g they slip, and with 200 steps gaps stay below {gap} m"
+        + (f" (step {named} is named as a failure)." if named else ".")
     )
 
 
@@ -119,12 +121,10 @@ def springs_win(rows):
     lines = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         enough = [r for r in rows if r["scene"] == scene and r["error_q"] is not None and r["error_q"] <= 2e-3]
-        ours = min((r["time_s"] for r in enough if r["way"] == OURS), default=None)
-        soft = min((r["time_s"] for r in enough if r["way"] in SPRINGS), default=None)
-        if soft is None:
-            lines.append(f"{scene}: springs never get to 2 mm, contacts in {1e3 * ours:.2f} ms")
-        else:
-            lines.append(f"{scene}: springs get to 2 mm in {1e3 * soft:.2f} ms, contacts in {1e3 * ours:.2f} ms")
+        ours = min((r["time_s"] for r in enough if r["way"] == OURS), default=math.inf)
+        soft = min((r["time_s"] for r in enough if r["way"] in SPRINGS), default=math.inf)
+        by_springs = "never get to 2 mm" if math.isinf(soft) else f"get to 2 mm in {1e3 * soft:.2f} ms"
+        lines.append(f"{scene}: springs {by_springs}, contacts in {1e3 * ours:.2f} ms")
     return "; ".join(lines)
 
 

@@ -5,6 +5,7 @@ a noise and a guess of its own, and is fitted with a step and with half of it.
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -56,7 +57,7 @@ def run(report, fast):
         fits.append(jax.tree.map(lambda *x: jnp.stack(x), *each))
         report.progress(f"fits with {steps} steps of a sample")
     off = {key: jnp.log(guess / truth[key]) for key, guess in guesses.items()}
-    found = judge(*fits, off) | {
+    found = judge(fits[0], fits[1], off) | {
         "truth": truth, "noise_m": deviation.tolist(), "samples": SAMPLES, "steps": [SAMPLES * n for n in STEPS],
         "iterations": int(jnp.max(fits[1].iterations)),
         "cost_per_residual": float(jnp.median(fits[1].cost)) / exact.size,
@@ -76,7 +77,8 @@ def figure(report, measured, first, guess, found):
     for j, (panel, name) in enumerate(zip(axes, ("x", "y"), strict=False)):
         panel.plot(t[1:], measured[:, j], ".", ms=2, color=COLOURS[7], label="record")
         for label, params, style in (("guess", guess, "--"), ("fit", first, "-")):
-            run = run_of(scene, steps, **{key: float(x) for key, x in params.items()})
+            values: Any = {key: float(x) for key, x in params.items()}
+            run = run_of(scene, steps, **values)
             panel.plot(run.t, run.q[:, j], style, color=COLOURS[label == "guess"], lw=1, label=label)
         panel.set(xlabel="time (s)", ylabel=f"{name} (m)")
     for i, (name, numbers) in enumerate(found["over_truth_with_interval"].items()):

@@ -3,12 +3,14 @@
 Independent of hhtjax: modes are written out for each scene.
 """
 
+from typing import Any
+
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from experiments.contact.scenes import GRAVITY
 
-TOLERANCES = {"rtol": 2.3e-14, "atol": 1e-14, "max_step": 0.02}
+TOLERANCES: Any = {"rtol": 2.3e-14, "atol": 1e-14, "max_step": 0.02}
 TINY = 1e-9  # s: the flight of the ball that does not begin
 
 
