@@ -78,15 +78,16 @@ def run(report, fast):
             "compile_time_plain_s": plain_compiling[what], "compile_time_s": compiling[what],
         }  # fmt: skip
         report.progress(f"{what}: {found[what]}")
-    found["switches_time"] = switching(report, 3 if fast else PAIRS)
+    if not fast:
+        found["switches_time"] = switching(report)
     return {"steps": STEPS, "derivative_steps": DERIVATIVE_STEPS, "members": MEMBERS, "rows": found}
 
 
-def switching(report, pairs):
+def switching(report):
     """Microseconds of a step of the ball, of all its steps, at two sizes: what impacts add."""
     scene, found = SCENES["ball"], {}
     for steps in (640, 5120):
         program = jax.jit(lambda mu, steps=steps: run_of(scene, steps, steps, mu=mu).q[-1])
-        found[f"{steps}"] = float(1e6 * least((partial(program, 0.1),), pairs)[0] / steps)
+        found[f"{steps}"] = float(1e6 * least((partial(program, 0.1),), PAIRS)[0] / steps)
     report.progress(f"ball, us per step: {found}")
     return found
