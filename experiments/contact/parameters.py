@@ -48,11 +48,10 @@ def run(report, fast):
     """All fits, and a figure of the first; the smoke run has one program for both fits of one record."""
     number = 1 if fast else RECORDS
     truth, guesses, measured, deviation, exact = records(number)
-    fits = []
+    weights, fits = jnp.broadcast_to(1 / deviation, exact.shape), []
     for steps in STEPS[:1] * 2 if fast else STEPS:
         each = [
-            fit_record({key: x[i] for key, x in guesses.items()}, measured[i], jnp.asarray(1 / deviation), steps)
-            for i in range(number)
+            fit_record({key: x[i] for key, x in guesses.items()}, measured[i], weights, steps) for i in range(number)
         ]
         fits.append(jax.tree.map(lambda *x: jnp.stack(x), *each))
         report.progress(f"fits with {steps} steps of a sample")

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from experiments.contact import by_exudyn
-from experiments.contact.scenes import GRAVITY, SCENES, disc, run_of, slope
+from experiments.contact.scenes import GRAVITY, SCENES, disc, run_of
 
 SAMPLES = 40
-OURS = (160, 640, 2560)
 SIZES = (160, 640, 2560, 10240, 40960, 163840)  # of MuJoCo
 SETTINGS = {"default": None, "stiffest": 0.9999}
 ANGLE, CREEP = 0.37, 10.0  # rad, s
@@ -97,21 +96,11 @@ def in_exudyn(sizes):
     return rows
 
 
-def ours(exact):
-    """The same with `Contact`."""
-    paths = {n: run_of(SCENES["rock"], n, n // SAMPLES).q for n in OURS}
-    held = run_of(slope(ANGLE, 0.0)._replace(T=CREEP), 500)
-    return {
-        "rock": [{"steps": n, "error_q": float(np.max(np.abs(q - exact)))} for n, q in paths.items()],
-        "creep_m_s": float(np.linalg.norm(held.q[-1])) / CREEP,
-    }
-
-
 def run(report, fast):
     """Each that is installed; the smoke run has few steps, and nothing that errors could be told by."""
     most = 20480
     exact = np.zeros((SAMPLES + 1, 3)) if fast else np.asarray(run_of(SCENES["rock"], most, most // SAMPLES).q)
-    found: dict = {} if fast else {"ours": ours(exact)}
+    found = {}
     if importlib.util.find_spec("mujoco"):
         found["mujoco"] = in_mujoco(report, exact, SIZES[:1] if fast else SIZES)
     if importlib.util.find_spec("exudyn"):
