@@ -59,7 +59,7 @@ def bars_table(numbers):
         worst([differences(row, key) for row in derivatives])
         for key in ("forward_minus_reverse", "difference_from_central")
     )
-    ratio = {what: x["ratio_of_times"] for what, x in cost.items()}
+    ratio = {what: x["ratio_of_times"] for what, x in cost.items() if "ratio_of_times" in x}
     error, derivative = (worst([x[key] for x in forms]) for key in ("error_m", "derivative_error"))
     compiling = cost["step"]["compile_time_s"][0]
     spread = f"{min(values):.2f} to {max(values):.2f}, {inside} of {len(values)} inside"
@@ -95,7 +95,7 @@ def closed_table(closed):
     """Errors of what has a formula."""
     rows = [[x["what"], small(x["error_m"]), small(x["derivative_error"])] for x in closed["slopes"]]
     for x in closed["rolling"]:
-        what = f"{x['what']}, loses {x['lost']:.10f} of its speed ({x['formula']:.10f})"
+        what = f"{x['what']}, loses {x['lost']:.6f} of its speed (formula {x['formula']:.6f})"
         rows.append([what, small(x["error_m"]), small(x["derivative_error"])])
     return table(["", "error (m, m/s)", "of derivatives"], rows)
 
@@ -119,7 +119,7 @@ def ways_table(rows):
         for steps in dict.fromkeys(row["steps"] for row in rows):
             by = {row["way"]: row for row in rows if (row["scene"], row["steps"]) == (scene, steps)}
             entries = [by.get(way) for way in (OURS, IMPULSES, *SPRINGS)]
-            cells = ["" if x is None else f"{small(x['error_q'])} ({1e3 * x['time_s']:.2g} ms)" for x in entries]
+            cells = ["" if x is None else f"{small(x['error_q'])} ({1e3 * x['time_s']:.3g} ms)" for x in entries]
             lines.append([scene, steps, *cells])
     return table(["", "steps", OURS, "impulses", *SPRINGS], lines)
 
