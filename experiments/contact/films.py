@@ -84,11 +84,11 @@ def strips(report, paths):
         q, t = np.asarray(run.q), np.asarray(run.t)
         panel.axhline(0, color="black", lw=0.8)
         panel.set_title(name)
-        panel.locator_params(axis="x", nbins=3)
+        panel.locator_params(axis="x", nbins=2 if name == "rock" else 3)
         if name == "hopper":
             for i, body in enumerate(("upper", "lower")):
                 panel.plot(t, q[:, i], color=COLOURS[i], ls=LINES[i])
-                panel.text(0.05, (0.95, 0.05)[i], body, color=COLOURS[i])
+                panel.text(0.0, (1.25, 0.3)[i], body, color=COLOURS[i])
             panel.set(xlabel="time (s)")
             continue
         last = len(q) // 2 if name == "rod" else len(q) - 1

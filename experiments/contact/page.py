@@ -21,7 +21,7 @@ def small(x, digits=1):
 
 def times(x):
     """A ratio."""
-    return f"{x:.2g}"
+    return f"{x:.0f}" if x >= 10 else f"{x:.1f}"
 
 
 def machine(made_by):
