@@ -84,7 +84,7 @@ def strips(report, paths):
         q, t = np.asarray(run.q), np.asarray(run.t)
         panel.axhline(0, color="black", lw=0.8)
         panel.set_title(name)
-        panel.locator_params(axis="x", nbins=2 if name == "rock" else 3)
+        panel.locator_params(axis="x", nbins=3)
         if name == "hopper":
             for i, body in enumerate(("upper", "lower")):
                 panel.plot(t, q[:, i], color=COLOURS[i], ls=LINES[i])
@@ -98,6 +98,8 @@ def strips(report, paths):
                 panel.plot(*line.T, color=COLOURS[0], alpha=0.2 + 0.8 * k / len(some), lw=1)
         if name == "ball":
             panel.plot(q[:, 0], q[:, 1] + 0.05, color=COLOURS[7], lw=0.6)
+        if name == "rock":
+            panel.set_xticks((-0.3, 0.3))
         panel.set_aspect("equal")
         panel.set(xlabel="x (m)")
     axes[0].set_ylabel("y (m)")
