@@ -27,6 +27,7 @@ EXPERIMENTS = {
     "tanks": "identification.tanks",
     "friction": "friction.friction",
     "events": "events.events",
+    "contact": "contact.contact",
     "stiff_joint": "identification.stiff_joint",
     "vehicle": "identification.vehicle",
     "robots": "robots.robots",

@@ -15,6 +15,7 @@ LARGEST = {".png": 200_000, ".gif": 400_000}  # bytes
     [
         "benchmarks",
         "cardona_geradin1989",
+        "contact",
         "events",
         "export",
         "flexible",

@@ -2,7 +2,8 @@
 
 located: the same force, with a mode in params that an event switches at the beginning and at the end of a contact,
 graded by the motion of the force. impact: an event with a reset, which the stiff force stands for, graded by the motion
-of a rigid stop, solved from impact to impact.
+of a rigid stop, solved from impact to impact. contact: `hhtjax.Contact` in the place of the force, for `hht`, with one
+restitution, that of the first impact; graded as impacts are.
 """
 
 from typing import Any, NamedTuple
@@ -57,8 +58,14 @@ STOPS = {
 }
 
 
+def fall(stop, case):
+    """The energy that the way to the stop gives, of 1 kg."""
+    ways = np.linspace(stop.wall, case.scene.q0[0], 1001)
+    return -np.trapezoid([float(stop.free(q)) for q in ways], ways)
+
+
 def with_stop(stop, way, case):
-    """The system, its params, and its event."""
+    """The system, its params, and its event, if it has one."""
 
     def force(q, v, t, params):
         depth = jnp.maximum(stop.wall - q, 1e-12)  # behind the mode; the power's derivative is finite
@@ -70,6 +77,12 @@ def with_stop(stop, way, case):
     def reset(q, v, t, params):
         return stop.rebound(-v)
 
+    if way == "contact":
+        speed = float(np.sqrt(case.scene.v0[0] ** 2 + 2 * fall(stop, case)))
+        floor = hhtjax.Contact(
+            gap=lambda q, t, params: q[0] - stop.wall, restitution=float(stop.rebound(speed)) / speed
+        )
+        return hhtjax.System(jnp.ones(1), lambda q, v, t, params: stop.free(q), contact=floor), case.scene.params, None
     located = hhtjax.Event(before, switch=lambda params: params | {"on": 1 - params["on"]})
     event = located if way == "located" else hhtjax.Event(before, reset=reset)
     return hhtjax.System(jnp.ones(1), force), case.scene.params | {"on": 0.0}, event
@@ -97,7 +110,7 @@ def program(stop, way, method, case, longest):
     def run(alpha, dt):
         found = hhtjax.simulate(
             system, METHODS[method].make(alpha), case.scene.q0, case.scene.v0, params, dt=dt, num_steps=longest,
-            events=[event], max_events=MAX_EVENTS, keep_events=1,
+            **({} if event is None else {"events": [event], "max_events": MAX_EVENTS, "keep_events": 1}),
         )  # fmt: skip
         return found.q, found.failure.step
 
@@ -139,7 +152,8 @@ def run(report, fast):
         found = {}
         for method in SHOWN[:1] if fast else SHOWN:
             found[method] = assess(case, steps, soft, method)
-            for way, reference in (("located", soft), ("impact", rigid)):
+            ways = {"located": soft, "impact": rigid} | ({"contact": rigid} if method.startswith("HHT") else {})
+            for way, reference in ways.items():
                 column = f"{method}\n{way}"
                 found[column], count = assess_events(case, steps, reference, method, way)
                 named.setdefault(case.name, {})[plain(column)] = count

@@ -1,0 +1,1 @@
+"""Contacts that rest, stick, slide, let go and land."""
