@@ -542,7 +542,10 @@ def test_coefficients_out_of_range_are_named():
     ):
         slides(0.2, 1.5)
     for mu, e in ((-0.2, 0.5), (jnp.nan, 0.5), (0.2, 1.5)):
-        with pytest.raises(hhtjax.SimulationError, match=r"negative or not finite, or its `restitution` is not in"):
+        with pytest.raises(
+            hhtjax.SimulationError,
+            match=r"`friction` of a contact must be a finite number, 0 or more, and its `restitution` lie in",
+        ):
             jax.jit(slides)(mu, e).check()
 
 

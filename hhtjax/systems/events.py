@@ -66,9 +66,10 @@ class Event(Description):
     the L that the run saves, of order 2; derivatives are those of the run, and of order 1.
 
     Resting contact is no event: a ball that comes to rest on the floor bounces infinitely often in a finite time, and
-    the run fails by name when more than `max_events` fall into a step. Give contacts that last a stiff force, or a
-    constraint that an event switches on, and another one off where its multiplier falls to zero: see
-    `hhtjax.scenes.shaken_table`. A body at rest at its guard may start where its acceleration takes it off.
+    the run fails by name when more than `max_events` fall into a step. Contacts that last are a `Contact` of the
+    system; in three dimensions a stiff force, or a constraint that an event switches on, and another one off where its
+    multiplier falls to zero: see `hhtjax.scenes.shaken_table`. A body at rest at its guard may start where its
+    acceleration takes it off.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind.
