@@ -16,6 +16,7 @@ follows. When it happens is a function of both ends of the step tried first, wit
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -25,8 +26,8 @@ from jax import lax
 from hhtjax.description import Array, PyTree
 from hhtjax.numerics.batched_cond import call_where, tree_where
 from hhtjax.numerics.checkpointed_scan import checkpoint
-from hhtjax.numerics.coulomb import inverted, proximal
-from hhtjax.numerics.dense_lu import diagonal, matvec
+from hhtjax.numerics.coulomb import inverted
+from hhtjax.numerics.dense_lu import matvec
 from hhtjax.steppers.constrained import report_constraints
 from hhtjax.steppers.contact_instant import past_switch
 from hhtjax.steppers.contact_modes import (
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
 
 SWITCHES = 4, 2  # in a step, and for each contact
 CORRECTIONS, MORE = 2, 24  # of the gap; and where it is not closed yet
-CLOSED, OPEN = 1.0, 64.0  # of what may be rounding, up to which a gap is closed, and beyond which one has stayed open
+OPEN = 64.0  # of what may be rounding, beyond which the gap of a closed contact has stayed open
 
 
 def bind_contact(method, system: FlatSystem, params: PyTree, dt: Array):
@@ -121,11 +122,7 @@ def _go_on(method, system: FlatSystem, params: PyTree, way: Way, h: Array) -> Wa
 def _part(method, system: FlatSystem, params: PyTree, s: State, h: Array):
     """The step h from s in which all contacts keep their modes, its `Info`, and its `Course`."""
     mu, c, size, n = system.contact.friction(params), method.coefficients, system.size, system.num_constraints
-    lag = h * c.gamma * (1 - c.alpha_f) / (1 - c.alpha_m)
-    gap, y, m = partial(system.contact.gap, params=params), partial(rates, system, params=params), len(mu)
-    modes, f0 = Modes(s.contact.closed, s.contact.sig), s.contact.f
-    held = modes.held(mu)
-    closed = held[:m]
+    modes, f0, y = Modes(s.contact.closed, s.contact.sig), s.contact.f, partial(rates, system, params=params)
     r, path, z, shift, B = equations_of(method, system, params, h, s)
 
     def loaded(s1: State) -> Array:
@@ -136,52 +133,85 @@ def _part(method, system: FlatSystem, params: PyTree, s: State, h: Array):
     at = path(z)
     z, info, inverse, _ = free_step(method.options, system, loaded, path, z, s, factorize, None)
     J = directions(system, at.q, at.t, params)
-    answers = each_row(inverse, jnp.pad(J, ((0, 0), (0, z.size - size))))
+    answers = each_row(inverse, jnp.pad(J, ((0, 0), (0, z.size - size))))  # by rows: G, and what it does to L
     K = across(J, answers[:, :size])
-    change = partial(matvec, inverted(matrix(K, modes, mu)).near)
-    df = change(right_side(y(at.q, path(z).v, at.t) / lag, f0, modes, mu))
+    forces = partial(matvec, inverted(matrix(K, modes, mu)).near)
+    lag = h * c.gamma * (1 - c.alpha_f) / (1 - c.alpha_m)
+    df = forces(right_side(y(at.q, path(z).v, at.t) / lag, f0, modes, mu))
 
     z = z + matvec(answers.T, df)
     x, s1 = method.advance(s, h, z[:size])[0], path(z)
     if shift is not None and (taken := shift(z[size + n :])) is not None:
         x = x - taken
-    Gv = system.widened(answers[:, : system.positions]).T  # internal states do not jump
-    slid = h * y(system.move(s.q, x / 2), x / h, s.t + h / 2)[m:]
+    G = system.widened(answers[:, : system.positions]).T  # internal states do not jump
+    held, roundings = modes.held(mu), _roundings(s1, J, K, f0 + df, h)
 
-    def closing(x: Array, slid: Array) -> Array:
-        open_by = gap(system.move(s.q, x), s1.t)
-        return x - matvec(Gv, change(jnp.where(held, jnp.concatenate([open_by, slid]), 0)))
+    def taken_off(rates: Array) -> Array:
+        """What takes these off where they are held."""
+        return matvec(G, forces(jnp.where(held, rates, 0)))
 
-    x = closing(x, slid)
-    for _ in range(CORRECTIONS - 1):
-        x = closing(x, jnp.zeros_like(slid))
-    of_gap, of_rate, of_force = _roundings(s1, J, K, f0 + df, h)
-
-    def open_at(x: Array) -> Array:
-        return jnp.any(jnp.where(closed, jnp.abs(gap(system.move(s.q, x), s1.t)) > CLOSED * of_gap, False))
-
-    def again(x: Array) -> Array:
-        return lax.fori_loop(0, MORE, lambda _, x: closing(x, jnp.zeros_like(slid)), x)
-
-    x = call_where(again, open_at(x), x)
-    q = system.move(s.q, x)
+    q = system.move(s.q, _closed_up(system, params, s, x, h, held, taken_off, roundings[0]))
     y1 = y(q, s1.v, s1.t)
-    v = s1.v - matvec(Gv, change(jnp.where(held, y1, 0)))
-    more = change(right_side(rates_of_rates(system, q, v, s1.w, s1.t, params), f0 + df, modes, mu))
-    w = s1.w + matvec(Gv, more)
-    a = s1.a - matvec(Gv, change(jnp.where(held, matvec(J, s1.a - w), 0)))
-    f1 = f0 + df + more
+    v = s1.v - taken_off(y1)
+    more = forces(right_side(rates_of_rates(system, q, v, s1.w, s1.t, params), f0 + df, modes, mu))
+    w = s1.w + matvec(G, more)
+    a = s1.a - taken_off(matvec(J, s1.a - w))
     L = None if s1.L is None else s1.L + matvec(answers[:, size : size + n].T, more)
-    s1 = system.tidy(s1._replace(q=q, v=v, w=w, a=a, L=L, contact=s.contact._replace(f=f1, code=jnp.zeros_like(h))))
-
-    g0, g1, y0 = gap(s.q, s.t), gap(s1.q, s1.t), y(s.q, s.v, s.t)
-    gaps, ends = (jnp.where(closed, 0, g0), jnp.where(closed, 0, g1)), (jnp.where(held, 0, y0), jnp.where(held, 0, y1))
-    course = Course(h, gaps, ends, (f0, f1), (of_gap, of_rate, of_force))
-    jams = closed & (presses(K, modes, mu) <= proximal(K.dtype) * jnp.abs(diagonal(K)[:m]))
-    stays_open = closed & (jnp.abs(g1) > OPEN * of_gap)
-    code = jnp.where(jnp.any(jams), Fault.JAMMED, jnp.where(jnp.any(stays_open), Fault.OPEN, 0)).astype(h.dtype)
+    contact = s.contact._replace(f=f0 + df + more, code=jnp.zeros_like(h))
+    s1 = system.tidy(s1._replace(q=q, v=v, w=w, a=a, L=L, contact=contact))
+    course, code = _course(system, params, s, s1, y1, modes, presses(K, modes, mu), roundings)
     info = info._replace(contact=jnp.maximum(s.contact.code, code))
     return s1, info if B is None else report_constraints(method, system, params, h, s, s1, info, B), course
+
+
+def _closed_up(
+    system: FlatSystem,
+    params: PyTree,
+    s: State,
+    x: Array,
+    h: Array,
+    held: Array,
+    taken_off: Callable,
+    of_gap: Array,
+) -> Array:
+    """The displacement x with the gaps of closed contacts at 0, and what sticks where it was."""
+    m = len(of_gap)
+
+    def gaps(x: Array) -> Array:
+        return system.contact.gap(system.move(s.q, x), s.t + h, params)
+
+    def closer(x: Array, slid: Array) -> Array:
+        return x - taken_off(jnp.concatenate([gaps(x), slid]))
+
+    slid = h * system.contact.sliding(system.move(s.q, x / 2), x / h, s.t + h / 2, params)
+    x = closer(x, slid)
+    for _ in range(CORRECTIONS - 1):
+        x = closer(x, jnp.zeros_like(slid))
+
+    def again(x: Array) -> Array:
+        return lax.fori_loop(0, MORE, lambda _, x: closer(x, jnp.zeros_like(slid)), x)
+
+    return call_where(again, jnp.any(held[:m] & (jnp.abs(gaps(x)) > of_gap)), x)
+
+
+def _course(
+    system: FlatSystem,
+    params: PyTree,
+    s: State,
+    s1: State,
+    y1: Array,
+    modes: Modes,
+    pressing: Array,
+    roundings: tuple,
+):
+    """The `Course` from s to s1, where rates are y1, and what has gone wrong in it. pressing: of `presses`."""
+    gap, closed, held = system.contact.gap, modes.closed > 0, modes.held(system.contact.friction(params))
+    g0, g1, y0 = gap(s.q, s.t, params), gap(s1.q, s1.t, params), rates(system, s.q, s.v, s.t, params)
+    ends = (jnp.where(closed, 0, g0), jnp.where(closed, 0, g1)), (jnp.where(held, 0, y0), jnp.where(held, 0, y1))
+    course = Course(s1.t - s.t, *ends, (s.contact.f, s1.contact.f), roundings)
+    jams, opens = closed & (pressing <= 0), closed & (jnp.abs(g1) > OPEN * roundings[0])
+    code = jnp.where(jnp.any(jams), Fault.JAMMED, jnp.where(jnp.any(opens), Fault.OPEN, 0)).astype(s.t.dtype)
+    return course, code
 
 
 def _roundings(s: State, J: Array, K: Array, f: Array, h: Array):

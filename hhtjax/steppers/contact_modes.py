@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hhtjax.description import Array
+from hhtjax.numerics.coulomb import proximal
 
 ROUNDING = 64  # of what a force, a rate or a gap is made of, that it may be beyond what its mode allows
 ON_CUBIC, NEARLY = 40, 1e-9  # iterations at most, and the change of theta that is the last
@@ -65,10 +66,11 @@ def right_side(y: Array, f: Array, modes: Modes, mu: Array) -> Array:
 
 
 def presses(K: Array, modes: Modes, mu: Array) -> Array:
-    """(m,): what normal force does to the gap of each contact with its friction. Where that is not positive the contact
-    jams (Painleve)."""
+    """(m,): what normal force does to the gap of each contact, with its friction, beyond rounding. Where that is not
+    positive the contact jams (Painleve)."""
     m = len(mu)
-    return jnp.stack([K[i, i] - modes.sig[i] * mu[i] * K[i, m + i] for i in range(m)])
+    small = proximal(K.dtype)
+    return jnp.stack([K[i, i] - modes.sig[i] * mu[i] * K[i, m + i] - small * jnp.abs(K[i, i]) for i in range(m)])
 
 
 class Switch(NamedTuple):
