@@ -7,6 +7,7 @@ import pytest
 
 from hhtjax.primitives import compat, one_kernel
 from hhtjax.xla import RANGE
+from hhtjax.xla.for_kernel import _each_sine_once
 from hhtjax.xla.sines import NAME
 
 pytestmark = pytest.mark.skipif(not compat.is_on(), reason="plain arrays with this version of JAX")
@@ -85,3 +86,21 @@ def test_what_can_be_together_is_one_call_and_others_are_as_they_were():
     single = jax.jit(lambda x: one_kernel(jnp.sin, x)).lower(jnp.float32(1)).as_text()
     assert NAME not in single
     assert NAME not in jax.jit(jnp.sin).lower(1.0).as_text()
+
+
+def test_what_comes_twice_is_computed_once():
+    """Also where what it is a sine of is computed twice, as by a function that is called again."""
+
+    def height(x, y):
+        return jnp.sin(2 * x) * y
+
+    def f(x, y):
+        a = height(x, y) + jnp.sin(3 * y)
+        return a * jnp.sin(a) + height(x, y + 1) * jax.jvp(lambda x: height(x, y), (x,), (a,))[1]
+
+    eqns = jax.make_jaxpr(f)(1.0, 2.0).jaxpr.eqns
+    kept, instead = _each_sine_once(eqns)
+    sines = [sum(eqn.primitive.name in ("sin", "cos") for eqn in some) for some in (eqns, kept)]
+    assert sines == [6, 4]  # sin 2x, sin 3y, sin a and cos 2x; twice more sin 2x
+    assert len(instead) == 2
+    assert abs(jax.jit(lambda x, y: one_kernel(f, x, y))(1.0, 2.0) - f(1.0, 2.0)) < 1e-13
