@@ -209,6 +209,12 @@ def energy_table(rows):
     return table(["", "lost in all (J)", *(f"largest rise in a step (J), {n} steps" for n in steps)], lines)
 
 
+def member_ratio(cost):
+    """The time of a step of a member of the batch, beside that of a run alone."""
+    step, batch = (cost["rows"][what]["contact_time_s"] for what in ("step", "batch"))
+    return f"{batch / cost['members'] / cost['member_steps'] / (step / cost['steps']):.2f}"
+
+
 def cost_table(cost):
     """Ratios."""
     names = {
@@ -276,6 +282,7 @@ def page(numbers):
             lowest_gap=min(row["lowest_gap_m"] for row in limits["gaps"]),
             gap_failed=f"{len(failed)} of the runs end in a named failure" if failed else "no run fails",
             energy=energy_table(limits["energy"]),
+            member_ratio=member_ratio(numbers["cost"]),
             cost=cost_table(numbers["cost"]),
             ball_us=", ".join(
                 f"{x:.2g} us a step with {n} steps" for n, x in numbers["cost"]["rows"]["switches_time"].items()
