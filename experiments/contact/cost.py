@@ -1,6 +1,7 @@
 """What contacts cost: the rod on the floor, both ends closed, beside the same system without; all of them in turn.
 
-The rod slides for longer than the run, a little pushed and turned: nothing switches. Times are the least of many, since others use the machine.
+The rod slides for longer than the run, a little pushed and turned: nothing switches. Times are the least of many, since
+others use the machine.
 """
 
 import time
