@@ -402,6 +402,18 @@ def test_events_and_contact():
 
 
 @pytest.mark.slow
+def test_sensors_see_contact():
+    scene = slope()
+    found = run(scene, 20)
+    shown = hhtjax.measure(
+        found, found.t[:-1] + 0.02, output=lambda q, contact: {"place": q[0], "push": contact.normal[0]}
+    )
+    rate = GRAVITY * (np.sin(0.3) - 0.2 * np.cos(0.3))
+    assert jnp.allclose(shown["place"], rate * (found.t[:-1] + 0.02) ** 2 / 2, atol=1e-12)
+    assert jnp.allclose(shown["push"], GRAVITY * np.cos(0.3), atol=1e-12)
+
+
+@pytest.mark.slow
 def test_what_is_known_of_contacts_survives_an_event():
     """One that changes nothing, while the ball rests and slides."""
     scene = ball()

@@ -212,7 +212,7 @@ def test_completion_shows_our_names():
     assert isinstance(run(), tuple)
     assert pickle.loads(pickle.dumps(State(1, 2, 3, 4))) == State(1, 2, 3, 4)
     assert run()._replace(t=1)[0] == 1
-    assert State(1, 2, 3, 4) == (1, 2, 3, 4, *[None] * 7)
+    assert State(1, 2, 3, 4) == (1, 2, 3, 4, *[None] * 8)
     assert jax.tree.leaves(State(1, 2, 3, 4)) == [1, 2, 3, 4]
     found = {x.name for x in jedi.Interpreter("run.", [{"run": run()}]).complete()}  # as in a kernel
     assert {"check", "q"} < found

@@ -14,7 +14,7 @@ from hhtjax.description.presentation import shown
 from hhtjax.numerics.batched_cond import if_any, tree_where
 from hhtjax.runs.driver import as_path, as_solution, saved
 from hhtjax.runs.output import output_at
-from hhtjax.runs.solution import Solution, told
+from hhtjax.runs.solution import ContactForces, Solution, told
 from hhtjax.steppers.stepper import State, public
 from hhtjax.steppers.taylor import Expansion, summed
 from hhtjax.systems import kinematics, zero_order_hold
@@ -38,6 +38,7 @@ class Interpolant(NamedTuple):
         z, zdot: internal states and their rates, None without.
         friction, sticking: dry friction, and whether a joint sticks, None without.
         output: what the run has in the place of all these, None without.
+        contact: `ContactForces`, None without.
     """
 
     q: PyTree
@@ -49,6 +50,7 @@ class Interpolant(NamedTuple):
     friction: Any = None
     sticking: Array | None = None
     output: PyTree = None
+    contact: Any = None
 
 
 def interpolate(solution: Solution, times: Real | None) -> Interpolant:
@@ -60,6 +62,9 @@ def interpolate(solution: Solution, times: Real | None) -> Interpolant:
     dry friction are straight lines, with O(H^2), the friction of a joint that begins to slide, or to stick, the nearer
     of the two that are saved. Of a run with `output=` straight lines join its outputs, numbers as they are: give such a
     run the times, `simulate(..., times=, output=)`, where O(H^2) is too much.
+
+    Forces of contacts are straight lines where nobody switches, else the nearer ones. Where a contact has landed in
+    between, all is of order 1: give such a run the times, too.
 
     Where events lie between two saved times, the polynomials end there: q with O(H^4), v and z (and y of a first-order
     system) straight lines with O(H^2), their rates constant; at the event itself v is that behind it. Multipliers and
@@ -232,6 +237,11 @@ def between(a: Solution, b: Solution, H: Array, x: Array) -> Solution:
         alike = (sticks0 == sticks1) & (sticks0 | (tau0 * tau1 >= 0))
         return jnp.where(alike, linear(tau0, tau1), nearer(tau0, tau1) + 0 * on_axes(x, tau0))
 
+    def pushing(c0: ContactForces, c1: ContactForces) -> ContactForces:
+        alike = (c0.closed == c1.closed) & (c0.sticking == c1.sticking)
+        forces = (jnp.where(alike, linear(f0, f1), nearer(f0, f1)) for f0, f1 in zip(c0[:2], c1[:2], strict=True))
+        return ContactForces(*forces, *map(nearer, c0[2:], c1[2:]))
+
     def told(y0: PyTree, y1):
         return (linear if jnp.issubdtype(y0.dtype, jnp.floating) else nearer)(y0, y1)
 
@@ -239,6 +249,8 @@ def between(a: Solution, b: Solution, H: Array, x: Array) -> Solution:
     if a.friction is not None:
         friction = rubbing(a.friction, b.friction, a.sticking, b.sticking)
         a = a._replace(friction=friction, sticking=nearer(a.sticking, b.sticking))
+    if a.contact is not None:
+        a = a._replace(contact=pushing(a.contact, b.contact))
     q = jax.tree.map(position, a.q, b.q, a.v, b.v)
     if a.acceleration is None:
         return a._replace(q=q, v=jax.tree.map(rate, a.q, b.q, a.v, b.v))
