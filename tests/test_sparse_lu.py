@@ -141,5 +141,5 @@ def test_what_it_does_not_solve_is_refused(kind):
         with pytest.raises(ValueError, match="`redundant` brings its own solver"):
             hhtjax.hht(redundant="least_squares", solve=hhtjax.sparse_lu())
         return
-    with pytest.raises(NotImplementedError, match="hht: leave out `solve` with dry friction, a LinearSystem"):
+    with pytest.raises(NotImplementedError, match="hht: leave out `solve` with dry friction, contact, a LinearSystem"):
         run(({"friction": rubbing, "linear": linear}[kind], jnp.ones(4)), hhtjax.sparse_lu())
