@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 import hhtjax
+from experiments.contact import scenes
 
 GRAVITY = 9.81
 
@@ -70,22 +71,10 @@ def disc(inertia: float = 0.5) -> Scene:
 
 
 def stack(amplitude: float, frequency: float = 8.0) -> Scene:
-    """Three boxes on each other, without rotations, on a floor that moves to and fro."""
-    masses, start = jnp.array([1.0, 0.7, 0.5]), jnp.array([0.0, 1.0, 2.0])
-    speed = amplitude * frequency
-
-    def gap(q, t, params):
-        return jnp.diff(q[3:], prepend=0.0) - jnp.array([0.0, 1.0, 1.0])
-
-    def sliding(q, v, t, params):
-        return jnp.diff(v[:3], prepend=speed * jnp.cos(frequency * t))
-
-    def force(q, v, t, params):
-        return jnp.concatenate([jnp.zeros(3), -GRAVITY * masses])
-
-    system = hhtjax.System(jnp.tile(masses, 2), force, contact=hhtjax.Contact(gap, sliding, "mu"))
-    q0, v0 = jnp.concatenate([jnp.zeros(3), start]), jnp.concatenate([jnp.full(3, speed), jnp.zeros(3)])
-    return Scene(system, q0, v0, {"mu": 0.5}, 2.0)
+    """That of the experiment: three boxes on each other, on a floor that moves to and fro."""
+    scene = scenes.stack(amplitude, frequency)
+    q0, v0 = scene.start(scene.params)
+    return Scene(scene.system, q0, v0, scene.params, scene.T)
 
 
 def standing(points, inertia: float, q0: Any, v0: Any, params: dict, T: float, restitution: Any = 0.0) -> Scene:

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from experiments.contact.scenes import GRAVITY
+from experiments.exudyn_run import settings
 
 
 def rolled(mu, v0, inertia, duration, steps, stiffness=1e6, zone=1e-4):
@@ -26,10 +27,5 @@ def rolled(mu, v0, inertia, duration, steps, stiffness=1e6, zone=1e-4):
         dryFrictionProportionalZone=zone,
     )  # fmt: skip
     system.Assemble()
-    settings = exu.SimulationSettings()
-    stepping = settings.timeIntegration
-    stepping.numberOfSteps, stepping.endTime, stepping.verboseMode = steps, duration, 0
-    stepping.generalizedAlpha.spectralRadius = 0.9
-    settings.solution.file.write = False
-    system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
+    system.SolveDynamic(settings(duration, steps), solverType=exu.DynamicSolverType.GeneralizedAlpha)
     return float(system.GetObjectOutputBody(body, exu.OutputVariableType.Velocity, [0, 0, 0])[1])

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from experiments.exudyn_run import settings
+
 # exudyn's impactModel: 0 a linear damper, 2 the law of Gonthier et al. and Carvalho, Martins, of the restitution
 LAWS = {"spring and damper": 0, "restitution": 2}
 
@@ -30,15 +32,12 @@ def fallen(law, gravity, e, duration, steps, stiffness, shortened=False):
     )
     system.AddLoad(items.LoadCoordinate(markerNumber=ends[1], load=-gravity))
     system.Assemble()
-    settings = exu.SimulationSettings()
-    stepping = settings.timeIntegration
-    stepping.numberOfSteps, stepping.endTime, stepping.verboseMode = steps, duration, 0
-    stepping.generalizedAlpha.spectralRadius = 0.9
+    how = settings(duration, steps)
+    stepping = how.timeIntegration
     stepping.adaptiveStep = stepping.discontinuous.useRecommendedStepSize = shortened
     stepping.minimumStepSize = 1e-12
     stepping.discontinuous.iterationTolerance = 1e-3
     stepping.discontinuous.maxIterations, stepping.discontinuous.ignoreMaxIterations = 10, True
-    settings.solution.file.write = False
-    system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha, storeSolver=True)
+    system.SolveDynamic(how, solverType=exu.DynamicSolverType.GeneralizedAlpha, storeSolver=True)
     q = system.GetNodeOutput(node, exu.OutputVariableType.Coordinates)
     return float(np.ravel(q)[0]), int(system.sys["dynamicSolver"].it.currentStepIndex) - 1

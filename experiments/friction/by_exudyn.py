@@ -4,6 +4,8 @@ from functools import partial
 
 import numpy as np
 
+from experiments.exudyn_run import settings
+
 WAYS = {  # exudyn's own words for them
     "exudyn, linear below 0.1 mm/s": {"frictionProportionalZone": 1e-4},
     "exudyn, sticking stiffness 1e6 N/m": {"stickingStiffness": 1e6, "stickingDamping": 1e3},
@@ -35,11 +37,7 @@ def path(params, way, A, W, constant, duration, steps, samples):
     out = items.SensorNode(nodeNumber=node, storeInternal=True, outputVariableType=exu.OutputVariableType.Coordinates)
     sensor = system.AddSensor(out)
     system.Assemble()
-    settings = exu.SimulationSettings()
-    stepping = settings.timeIntegration
-    stepping.numberOfSteps, stepping.endTime, stepping.verboseMode = steps, duration, 0
-    stepping.generalizedAlpha.spectralRadius = 0.9
-    settings.solution.file.write = False
-    settings.solution.sensors.writePeriod = duration / samples
-    system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
+    how = settings(duration, steps)
+    how.solution.sensors.writePeriod = duration / samples
+    system.SolveDynamic(how, solverType=exu.DynamicSolverType.GeneralizedAlpha)
     return np.asarray(system.GetSensorStoredData(sensor))[:, 1]

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.exudyn_run import settings
 from hhtjax.bodies import Mechanism
 
 WAYS = {"exudyn generalized alpha": "GeneralizedAlpha", "exudyn trapezoidal, index 2": "TrapezoidalIndex2"}
@@ -105,14 +106,10 @@ def built(robot: Mechanism, q0: np.ndarray, v0: np.ndarray) -> tuple:
     return system, node
 
 
-def settings(duration: float, steps: int, samples: int) -> Any:
+def sampled_settings(duration: float, steps: int, samples: int) -> Any:
     """Of a run of so many steps."""
-    found = importlib.import_module("exudyn").SimulationSettings()
-    stepping = found.timeIntegration
-    stepping.numberOfSteps, stepping.endTime, stepping.verboseMode = steps, duration, 0
-    stepping.generalizedAlpha.spectralRadius = 0.9
-    stepping.newton.relativeTolerance = TOLERANCE
-    found.solution.file.write = False
+    found = settings(duration, steps)
+    found.timeIntegration.newton.relativeTolerance = TOLERANCE
     found.solution.sensors.writePeriod = duration / samples
     return found
 
@@ -125,7 +122,7 @@ def path(robot: Mechanism, q0: np.ndarray, v0: np.ndarray, way: str, duration: f
     sensor = system.AddSensor(out)
     system.Assemble()
     exu.config.suppressWarnings = True
-    options = settings(duration, steps, samples)
+    options = sampled_settings(duration, steps, samples)
     start = time.perf_counter()
     try:
         system.SolveDynamic(options, solverType=getattr(exu.DynamicSolverType, WAYS[way]), showHints=False)
@@ -143,11 +140,11 @@ def accelerations(robot: Mechanism, q0: np.ndarray, v0: np.ndarray) -> np.ndarra
     system, _ = built(robot, q0, v0)
     system.Assemble()
     solver = exu.MainSolverImplicitSecondOrder()
-    solver.InitializeSolver(system, settings(1.0, 1, 1))
+    solver.InitializeSolver(system, sampled_settings(1.0, 1, 1))
     solver.ComputeMassMatrix(system)
     M = np.array(solver.GetSystemMassMatrix())
     solver.ComputeODE2RHS(system)
     n = len(M)
     force = np.array(solver.GetSystemResidual())[:n]
-    solver.FinalizeSolver(system, settings(1.0, 1, 1))
+    solver.FinalizeSolver(system, sampled_settings(1.0, 1, 1))
     return np.linalg.solve(M, force)

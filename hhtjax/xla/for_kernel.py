@@ -54,6 +54,7 @@ COMBINED = {"scatter": lambda before, given: given} | {
 LEAST = 6  # operations of a stage that is a kernel; fewer are one fusion or two anyway
 LARGEST = 8192  # numbers of an array; XLA may divide the work on larger ones among threads
 IDLE = {"broadcast_in_dim"}  # what a branch may hold that has nothing to do
+SINES = {"sin", "cos"}
 MANY = 4  # values of a conditional: of fewer, a loop is no better
 INSIDE = object()  # what becomes of the question whether a kernel holds it
 IDENTITIES = {"hhtjax_structural", "hhtjax_largest_in_batch"}
@@ -344,6 +345,8 @@ def _scattered(combine: Callable, dims, x: Array, indices: Array, updates: Array
 def _each_sine_once(eqns: list):
     """The equations without sines and cosines that are there already, of the same number, and what stands for these: a
     sine is a call, of which XLA does not see that it comes twice."""
+    if sum(eqn.primitive.name in SINES for eqn in eqns) < 2:
+        return eqns, {}
     made, same, known, instead = [], {}, {}, {}  # variable -> the first one of its value; what makes it -> variables
     for eqn in eqns:
         operands = tuple((str(x), x.aval) if isinstance(x, Literal) else same.get(x, x) for x in eqn.invars)
@@ -353,7 +356,7 @@ def _each_sine_once(eqns: list):
             found = eqn.outvars
         if found is not eqn.outvars and not eqn.effects:
             same.update(zip(eqn.outvars, found, strict=True))
-            if eqn.primitive.name in ("sin", "cos"):
+            if eqn.primitive.name in SINES:
                 instead[eqn.outvars[0]] = found[0]
                 continue
         made.append(eqn)
@@ -375,7 +378,7 @@ def _with_sines_together(eqns: list):
         since.clear()
 
     for eqn in eqns:
-        if eqn.primitive.name in ("sin", "cos") and _is_sine(eqn):
+        if eqn.primitive.name in SINES and _is_sine(eqn):
             x = eqn.invars[0]
             if group and (x.aval.shape != group[0].invars[0].aval.shape or x in since):
                 end()
