@@ -20,17 +20,30 @@ class Scene(NamedTuple):
     T: float
 
 
+def of_experiment(scene: scenes.Scene) -> Scene:
+    """One of the experiment's, which start from their params."""
+    q0, v0 = scene.start(scene.params)
+    return Scene(scene.system, q0, v0, scene.params, scene.T)
+
+
 def ball() -> Scene:
     """A ball with drag, and spin along the floor: it bounces to rest, and then its sliding ends, too."""
-    floor = hhtjax.Contact(
-        gap=lambda q, t, params: q[1], sliding=lambda q, v, t, params: v[0], friction="mu", restitution="e"
-    )
+    return of_experiment(scenes.ball())
 
-    def force(q, v, t, params):
-        return jnp.array([0.0, -GRAVITY], q.dtype) - params["c"] * v
 
-    system = hhtjax.System(jnp.ones(2), force, contact=floor)
-    return Scene(system, jnp.array([0.0, 1.0]), jnp.array([2.0, 0.0]), {"e": 0.6, "c": 0.3, "mu": 0.1}, 3.0)
+def table() -> Scene:
+    """A mass on a table that moves to and fro, pulled by a spring, with a changing load: it sticks and slips."""
+    return of_experiment(scenes.table())
+
+
+def disc(inertia: float = 0.5) -> Scene:
+    """A disc of radius 1 (or a sphere: inertia 2/5), that slides along a floor until it rolls."""
+    return of_experiment(scenes.disc(inertia))
+
+
+def stack(amplitude: float) -> Scene:
+    """Three boxes on each other, without rotations, on a floor that moves to and fro."""
+    return of_experiment(scenes.stack(amplitude))
 
 
 def slope() -> Scene:
@@ -41,40 +54,6 @@ def slope() -> Scene:
         return GRAVITY * jnp.array([jnp.sin(0.3), -jnp.cos(0.3)])
 
     return Scene(hhtjax.System(jnp.ones(2), force, contact=on), jnp.zeros(2), jnp.zeros(2), {"mu": 0.2}, 1.0)
-
-
-def table(amplitude: float = 0.05, frequency: float = 12.0) -> Scene:
-    """A mass on a table that moves to and fro, pulled by a spring, with a changing load: it sticks and slips."""
-    speed = amplitude * frequency
-    on = hhtjax.Contact(
-        gap=lambda q, t, params: q[1],
-        sliding=lambda q, v, t, params: v[0] - speed * jnp.cos(frequency * t),
-        friction="mu",
-    )
-
-    def force(q, v, t, params):
-        return jnp.stack([-2.0 * q[0] - 0.3 * v[0], -1.3 * GRAVITY + 3 * jnp.sin(3 * t)])
-
-    system = hhtjax.System(jnp.full(2, 1.3), force, contact=on)
-    return Scene(system, jnp.zeros(2), jnp.array([speed, 0.0]), {"mu": 0.4}, 2.0)
-
-
-def disc(inertia: float = 0.5) -> Scene:
-    """A disc of radius 1 (or a sphere: inertia 2/5), that slides along a floor until it rolls."""
-    floor = hhtjax.Contact(
-        gap=lambda q, t, params: q[1] - 1, sliding=lambda q, v, t, params: v[0] + v[2], friction="mu"
-    )
-    system = hhtjax.System(
-        jnp.array([1.0, 1.0, inertia]), lambda q, v, t, params: jnp.array([0.0, -GRAVITY, 0.0]), contact=floor
-    )
-    return Scene(system, jnp.array([0.0, 1.0, 0.0]), jnp.array([2.0, 0.0, 0.0]), {"mu": 0.2}, 1.0)
-
-
-def stack(amplitude: float, frequency: float = 8.0) -> Scene:
-    """That of the experiment: three boxes on each other, on a floor that moves to and fro."""
-    scene = scenes.stack(amplitude, frequency)
-    q0, v0 = scene.start(scene.params)
-    return Scene(scene.system, q0, v0, scene.params, scene.T)
 
 
 def standing(points, inertia: float, q0: Any, v0: Any, params: dict, T: float, restitution: Any = 0.0) -> Scene:

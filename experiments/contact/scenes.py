@@ -50,7 +50,7 @@ def ball(drag=0.3) -> Scene:
     )
 
     def force(q, v, t, params):
-        return jnp.array([0.0, -GRAVITY]) - params["c"] * v
+        return jnp.array([0.0, -GRAVITY], q.dtype) - params["c"] * v
 
     def start(params):
         return jnp.array([0.0, 1.0]), jnp.array([2.0, 0.0])
