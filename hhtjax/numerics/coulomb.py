@@ -17,7 +17,7 @@ from jax import lax
 
 from hhtjax.description import Array
 from hhtjax.numerics.complementarity import complement
-from hhtjax.numerics.dense_lu import diagonal, matvec, with_slope
+from hhtjax.numerics.dense_lu import diagonal, product, with_slope
 
 PROXIMAL = 1e-9  # of a row, added to its diagonal: contacts may depend on each other; in float32 100 roundings
 
@@ -34,8 +34,8 @@ class SmallInverse(NamedTuple):
     near: Array  # the inverse of S, a little regularised, which is right to `proximal`
 
     def __call__(self, b: Array) -> Array:
-        x = matvec(self.near, b)
-        return x if len(b) == 2 else x + matvec(self.near, b - matvec(self.S, x))
+        x = product(self.near, b)
+        return x if len(b) == 2 else x + product(self.near, b - product(self.S, x))
 
 
 def inverted(S: Array) -> SmallInverse:
@@ -93,7 +93,7 @@ def choice(K: Array, y: Array, mu: Array, off: Array, here: Array, sliding: Arra
     found = complement(M, jnp.where(some, jnp.concatenate([y, -y[m:], mu * off]), 1))
     f_N, one_way, other, _ = found.z.reshape(4, m)
     f = jnp.concatenate([f_N, jnp.where(rests, one_way - other, -sliding * mu * f_N)])
-    along = (y + matvec(K, f))[m:]
+    along = (y + product(K, f))[m:]
     pushes, one_way, other, slips = found.basic.reshape(4, m)
     jams = jnp.any(here & (sliding != 0) & (diagonal(of_N[:m]) <= proximal(K.dtype)))
     sticks = jnp.where(slips, one_way & other, one_way | other)
@@ -110,7 +110,7 @@ def impulses(K: Array, y: Array, mu: Array, e: Array, here: Array) -> Array:
     def phase(now: tuple, _):
         y, back = now  # in the second one at least e times the normal impulses of the first come back
         f = _phase(K, y, mu, back, here) + jnp.concatenate([back, jnp.zeros_like(back)])
-        return (y + matvec(K, f) + matvec(K[:, :m], e * f[:m]), e * f[:m]), f
+        return (y + product(K, f) + product(K[:, :m], e * f[:m]), e * f[:m]), f
 
     return jnp.sum(lax.scan(phase, (y, jnp.zeros_like(e)), length=2)[1], axis=0)
 
@@ -125,4 +125,4 @@ def _phase(K: Array, y: Array, mu: Array, off: Array, here: Array) -> Array:
         [jnp.where(chosen.pushes[:, None], K[:m], one[:m]), jnp.where(chosen.sticks[:, None], K[m:], along)]
     )
     b = jnp.concatenate([jnp.where(chosen.pushes, -y[:m], 0), jnp.where(chosen.sticks, -y[m:], -chosen.sig * mu * off)])
-    return chosen.f + inverted(S)(b - matvec(S, chosen.f))
+    return chosen.f + inverted(S)(b - product(S, chosen.f))

@@ -27,7 +27,7 @@ from hhtjax.description import Array, PyTree
 from hhtjax.numerics.batched_cond import call_where, tree_where
 from hhtjax.numerics.checkpointed_scan import checkpoint
 from hhtjax.numerics.coulomb import inverted
-from hhtjax.numerics.dense_lu import matvec
+from hhtjax.numerics.dense_lu import product
 from hhtjax.steppers.constrained import report_constraints
 from hhtjax.steppers.contact_instant import past_switch
 from hhtjax.steppers.contact_modes import (
@@ -135,11 +135,11 @@ def _part(method, system: FlatSystem, params: PyTree, s: State, h: Array):
     J = directions(system, at.q, at.t, params)
     answers = each_row(inverse, jnp.pad(J, ((0, 0), (0, z.size - size))))  # by rows: G, and what it does to L
     K = across(J, answers[:, :size])
-    forces = partial(matvec, inverted(matrix(K, modes, mu)).near)
+    forces = partial(product, inverted(matrix(K, modes, mu)).near)
     lag = h * c.gamma * (1 - c.alpha_f) / (1 - c.alpha_m)
     df = forces(right_side(y(at.q, path(z).v, at.t) / lag, f0, modes, mu))
 
-    z = z + matvec(answers.T, df)
+    z = z + product(answers.T, df)
     x, s1 = method.advance(s, h, z[:size])[0], path(z)
     if shift is not None and (taken := shift(z[size + n :])) is not None:
         x = x - taken
@@ -148,15 +148,15 @@ def _part(method, system: FlatSystem, params: PyTree, s: State, h: Array):
 
     def taken_off(rates: Array) -> Array:
         """What takes these off where they are held."""
-        return matvec(G, forces(jnp.where(held, rates, 0)))
+        return product(G, forces(jnp.where(held, rates, 0)))
 
     q = system.move(s.q, _closed_up(system, params, s, x, h, held, taken_off, roundings[0]))
     y1 = y(q, s1.v, s1.t)
     v = s1.v - taken_off(y1)
     more = forces(right_side(rates_of_rates(system, q, v, s1.w, s1.t, params), f0 + df, modes, mu))
-    w = s1.w + matvec(G, more)
-    a = s1.a - taken_off(matvec(J, s1.a - w))
-    L = None if s1.L is None else s1.L + matvec(answers[:, size : size + n].T, more)
+    w = s1.w + product(G, more)
+    a = s1.a - taken_off(product(J, s1.a - w))
+    L = None if s1.L is None else s1.L + product(answers[:, size : size + n].T, more)
     contact = s.contact._replace(f=f0 + df + more, code=jnp.zeros_like(h))
     s1 = system.tidy(s1._replace(q=q, v=v, w=w, a=a, L=L, contact=contact))
     course, code = _course(system, params, s, s1, y1, modes, presses(K, modes, mu), roundings)
@@ -217,6 +217,6 @@ def _course(
 def _roundings(s: State, J: Array, K: Array, f: Array, h: Array):
     """What gaps, rates and forces may be beyond 0: roundings of what they are made of, contact forces among it."""
     few, m = ROUNDING * float(jnp.finfo(f.dtype).eps), len(J) // 2
-    along, pushed = matvec(jnp.abs(J), jnp.abs(s.v))[m:], h * matvec(jnp.abs(K), jnp.abs(f))
+    along, pushed = product(jnp.abs(J), jnp.abs(s.v))[m:], h * product(jnp.abs(K), jnp.abs(f))
     of_gap = jnp.sum(jnp.abs(J[:m]), axis=1) * jnp.max(jnp.abs(s.q)) + h * pushed[:m]
     return few * of_gap, few * (along + pushed[m:]), few * jnp.max(jnp.abs(f))

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from hhtjax.description import Array, PyTree
 from hhtjax.numerics.coulomb import choice, impulses, inverted
-from hhtjax.numerics.dense_lu import diagonal, matvec
+from hhtjax.numerics.dense_lu import diagonal, product
 from hhtjax.steppers.contact_modes import Modes, matrix, right_side
 from hhtjax.steppers.stepper import ContactState, State
 from hhtjax.steppers.variable_step import drifted
@@ -96,7 +96,7 @@ def past_switch(method, system: FlatSystem, params: PyTree, before: tuple, switc
     e = jnp.where(hits & ~jnp.any(others, axis=1), e, 0)
     struck = jnp.any(hits)
     imp = impulses(place.K, y, mu, e, here & struck)
-    v, y = v + matvec(place.G.T, imp), y + matvec(place.K, imp)
+    v, y = v + product(place.G.T, imp), y + product(place.K, imp)
 
     w, _ = _free(system, place, q, v, t, params)
     falling = -rates_of_rates(system, q, v, w, t, params)[:m]
@@ -138,7 +138,7 @@ def _late(system: FlatSystem, params: PyTree, s: State, switch: Switch, h: Array
 def _held(place: Place, held: Array, v: Array, y: Array) -> Array:
     """The velocities with which the rates y that are held, (2 m,), are 0."""
     S = jnp.where(held[:, None], place.K, jnp.eye(len(y), dtype=y.dtype))
-    return v + matvec(place.G.T, inverted(S)(jnp.where(held, -y, 0)))
+    return v + product(place.G.T, inverted(S)(jnp.where(held, -y, 0)))
 
 
 def _anew(
@@ -153,8 +153,8 @@ def _anew(
     closed = found.pushes if stays is None else found.pushes | (stays & down)
     modes = Modes(closed.astype(v.dtype), jnp.where(closed, found.sig, 0))
     f = inverted(matrix(place.K, modes, mu))(right_side(ydot, jnp.zeros_like(ydot), modes, mu))
-    w = w + matvec(place.G.T, f)
-    L = None if L is None else L + matvec(place.pulls.T, f)
+    w = w + product(place.G.T, f)
+    L = None if L is None else L + product(place.pulls.T, f)
     code = jnp.where(found.jams, Fault.JAMMED, jnp.where(found.found, 0, Fault.NO_FORCES)).astype(v.dtype)
     known = s.contact._replace(sticks=modes.which(mu)[1].astype(v.dtype), code=jnp.maximum(s.contact.code, code))
     return s._replace(v=v, w=w, a=w, L=L, contact=known._replace(f=f, closed=modes.closed, sig=modes.sig))

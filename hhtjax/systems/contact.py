@@ -21,7 +21,7 @@ import numpy as np
 from hhtjax.checks import count, describe, require_function, require_number
 from hhtjax.description import Array, Description, PyTree, Real, is_array, thaw
 from hhtjax.jaxpr import linear_map
-from hhtjax.numerics.dense_lu import matvec
+from hhtjax.numerics.dense_lu import product
 from hhtjax.primitives import consistent
 
 if TYPE_CHECKING:
@@ -197,7 +197,7 @@ def reaction(system: FlatSystem, q: Array, t: Array, params: PyTree, f: Array) -
 
 def speeds(J: Array, v: Array, w: Array, h: Array) -> Array:
     """(m,): what rates of each contact are made of in a step h, by which is told what is 0 of them."""
-    fast = matvec(jnp.abs(J), jnp.abs(v) + h * jnp.abs(w))
+    fast = product(jnp.abs(J), jnp.abs(v) + h * jnp.abs(w))
     m = len(fast) // 2
     return jnp.maximum(fast[:m], fast[m:])
 
