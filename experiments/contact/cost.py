@@ -34,6 +34,21 @@ def last_of(contact, steps):
     return last
 
 
+def forward(last):
+    """The value and its derivative in the speed; the value too, since without contact that derivative is constant."""
+
+    def twice(mu, v0):
+        q = last(mu, v0)
+        return q, q
+
+    return jax.jacfwd(twice, 1, has_aux=True)
+
+
+def reverse(last):
+    """A sum and its gradient in the same."""
+    return jax.value_and_grad(lambda mu, v0: jnp.sum(last(mu, v0)), 1)
+
+
 def seconds(function):
     """Of a call."""
     begun = time.perf_counter()
@@ -61,8 +76,8 @@ def programs(contact):
     several = jnp.linspace(0.1, 0.2, MEMBERS), jnp.linspace(1.0, 2.0, MEMBERS)
     plan = {
         "step": (last_of(contact, STEPS), (x, y)),
-        "forward": (jax.jacfwd(last_of(contact, DERIVATIVE_STEPS), 1), (x, y)),
-        "reverse": (jax.jacrev(last_of(contact, DERIVATIVE_STEPS), 1), (x, y)),
+        "forward": (forward(last_of(contact, DERIVATIVE_STEPS)), (x, y)),
+        "reverse": (reverse(last_of(contact, DERIVATIVE_STEPS)), (x, y)),
         "batch": (jax.vmap(last_of(contact, MEMBER_STEPS)), several),
     }
     made, taken = {}, {}
