@@ -69,10 +69,12 @@ from hhtjax.runs.adaptive import adaptive
 from hhtjax.runs.controlled_run import choose_steps
 from hhtjax.runs.error_control import Steps
 from hhtjax.runs.interpolate import Interpolant, interpolate
+from hhtjax.runs.load_sweep import load_sweep
+from hhtjax.runs.parallel_map import parallel_map
 from hhtjax.runs.simulate import simulate
 from hhtjax.runs.solution import Events, FailedRunWarning, Failure, SimulationError, Solution
 from hhtjax.runs.sweep import sweep
-from hhtjax.runs.sweep_to_disk import load_sweep, sweep_to_disk
+from hhtjax.runs.sweep_to_disk import map_to_disk, sweep_to_disk
 from hhtjax.steppers.collocation import wilson
 from hhtjax.steppers.extrapolated import extrapolated
 from hhtjax.steppers.generalized_alpha import bossak, generalized_alpha, hht, implicit_euler, newmark
@@ -108,6 +110,7 @@ __all__ = [  # noqa: RUF022
     # runs
     "Failure", "FailedRunWarning", "SimulationError", "Solution", "simulate", "Interpolant", "interpolate",
     "Events", "Steps", "adaptive", "choose_steps", "sweep", "sweep_to_disk", "load_sweep",
+    "parallel_map", "map_to_disk",
     "Explanation", "explain", "keep_programs", "plain",
     # out of Python
     "ExportedC", "ExportedFMU", "export_c", "export_fmu",

@@ -117,7 +117,10 @@ class Arrow(NamedTuple):
 
     def see(self, x: Array) -> Seen:
         """What `arrow_trial` has to know of x."""
-        r, J, J_own = self.read(x)
+        return self.seen(x, *self.read(x))
+
+    def seen(self, x: Array, r: Array, J: Array, J_own: Array) -> Seen:
+        """The same, of what has been read."""
         both = jnp.concatenate([J_own, J], axis=2)
         r_hat, both_hat = self.objective.least_squares(r.ravel(), both.reshape(r.size, -1))
         bend = None if self.bend is None else self.bend(x[: self.p])

@@ -9,15 +9,21 @@ optimiser on reverse-mode gradients for many.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
 
-from hhtjax.checks import require_function, require_number
-from hhtjax.description import PyTree, Real, current, is_concrete, is_tracing, thaw, with_data
+from hhtjax.checks import require_function, require_integer, require_number
+from hhtjax.description import PyTree, Real, all_concrete, current, is_concrete, is_tracing, thaw, with_data
 from hhtjax.description.presentation import shown
 from hhtjax.identification.arguments import (
+    LEVENBERG_MARQUARDT,
     check_options,
     check_parameters,
     check_prior,
@@ -28,11 +34,13 @@ from hhtjax.identification.arguments import (
 )
 from hhtjax.identification.identifiability import warn_undetermined
 from hhtjax.identification.least_squares import BAD_START, NO_INFLUENCE
+from hhtjax.identification.many_records import Many
 from hhtjax.identification.parameter_vector import Data
 from hhtjax.identification.problem import is_on_host, solve, solve_on_host
 from hhtjax.identification.residuals import check_weights, first_bad
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
+from hhtjax.runs.executors import Chunks, Work, collected, require_executor
 
 if TYPE_CHECKING:
     from hhtjax.identification.arguments import Options
@@ -55,6 +63,9 @@ def fit(
     covariance: bool = True,
     segments: int = SEGMENTS,
     progress: bool = False,
+    executor: Executor | None = None,
+    mesh: Mesh | None = None,
+    chunk: int = 1,
 ) -> FitResult:
     """The parameters that minimise the sum of squares of `residuals(params)`.
 
@@ -92,6 +103,12 @@ def fit(
             residuals are cut: how much these disagree gives the standard errors (the cluster covariance of
             `Uncertainty`). Of `records` whole ones, where that makes 8 and more than there are parameters.
         progress: show cost and step of the last iteration in one line on stderr, and why it stopped.
+        executor: whose workers evaluate `records`, as for `parallel_map`. What comes back of each is a triangle, which
+            is as large as its numbers of unknowns; residuals and Jacobians do so once, at the minimum, for standard
+            errors. By Levenberg-Marquardt, outside jit; its steps are not bent (geodesic acceleration), which takes the
+            rows, so there may be more of them. The minimum is the same.
+        mesh: devices that do so, in the place of an executor, `jax.make_mesh((jax.device_count(),), ("records",))`.
+        chunk: records in a task of an executor.
 
     A function is traced and compiled once, and anew where something that it reads from outside differs, as `simulate`
     says; arrays are compared by their bytes. Arrays of floats are then data, if what is computed from them can be
@@ -141,9 +158,30 @@ def fit(
         data = data._replace(records=records, starts=check_records("fit", records, starts, prior, options.optimizer))
     alone = is_on_host(options, params0, data)
     options = options._replace(loss=options.loss and current(options.loss))
-    result = _solved(solve_on_host if alone else solve, residuals, options, params0, data)
+    solver = solve_on_host if alone else solve
+    if executor is not None or mesh is not None:
+        solver = partial(solve_on_host, many=_many(options, of_records, alone, executor, mesh, chunk))
+    result = _solved(solver, residuals, options, params0, data)
     result = result._replace(params=thaw(result.params))
     return _finished("fit", result, weights) if is_concrete(result.code) else result
+
+
+def _many(options: Options, of_records: bool, alone: bool, executor: Any, mesh: Any, chunk: int) -> Many:
+    """Who evaluates the records, or an error."""
+    if executor is not None and mesh is not None:
+        raise ValueError("fit: give an `executor` or a `mesh`, not both.")
+    if not of_records or options.optimizer != LEVENBERG_MARQUARDT:
+        raise ValueError(
+            "fit: an `executor` or a `mesh` shares out `records`, for Levenberg-Marquardt; without `records` use "
+            "sweep(mesh=) in the residuals."
+        )
+    if not alone:
+        raise TypeError("fit: with an `executor` or a `mesh`, call it outside jit, vmap and grad, on the CPU.")
+    if mesh is not None and not isinstance(mesh, Mesh):
+        raise TypeError(f"fit: `mesh` must be a jax.sharding.Mesh; received {mesh!r}.")
+    if mesh is not None:
+        mesh = Mesh(mesh.devices.ravel(), ("records",))  # whatever its shape and its types of axes
+    return Many(require_executor("fit", executor), mesh, require_integer("fit", "chunk", chunk))
 
 
 def _solved(solver, residuals: Callable, options: Options, params0: PyTree, data: PyTree) -> FitResult:
@@ -185,20 +223,25 @@ def multistart(
     tolerance: Real = 1e-8,
     covariance: bool = True,
     segments: int = SEGMENTS,
+    executor: Executor | None = None,
+    chunk: int = 1,
 ) -> Multistart:
-    """`fit` from several starts at once, vectorised.
+    """`fit` from several starts at once, vectorised, or by the workers of an executor.
 
     Args:
         starts: a pytree like params0, each leaf with a leading axis, one entry for each start.
         scale: a pytree like params0; by default that of the first start.
         residuals, optimizer, transforms, weights, loss, prior, max_iterations, tolerance, covariance, segments: as in
             `fit`.
+        executor: whose workers fit, as for `parallel_map`; the call has to stand outside jit.
+        chunk: with an executor, starts in a task. Those of a chunk are iterated as long as the last of them needs.
 
     Returns:
         A `Multistart`.
 
     Raises:
         TypeError, ValueError: as `fit`; starts of unequal numbers; residuals that are finite at none of them.
+        NotImplementedError, RuntimeError: of an executor, as `parallel_map`.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> t = jnp.linspace(0.0, 6.0, 50)
@@ -216,12 +259,41 @@ def multistart(
     check_transforms("multistart", transforms, starts, "starts")
     data = _check_data("multistart", first, scale, weights, prior, tolerance)
     residuals, options = current(residuals), options._replace(loss=options.loss and current(options.loss))
-    every = jax.vmap(lambda start: solve(residuals, options, start, data))(starts)
+    if executor is None:
+        every = jax.vmap(lambda start: solve(residuals, options, start, data))(starts)
+    else:
+        fits = _Starts(residuals, options, jax.tree.structure((data, starts)))
+        every = _by_workers(fits, data, starts, executor, chunk)
     failed = (every.code == BAD_START) | (every.code == NO_INFLUENCE) | jnp.isnan(every.cost)
     cost = jnp.where(failed, jnp.inf, every.cost)
     best = jax.tree.map(lambda x: x[jnp.argmin(cost)], every)
     best, every = (result._replace(params=thaw(result.params)) for result in (best, every))
     return Multistart(_finished("multistart", best, weights) if is_concrete(best.code) else best, every)
+
+
+@dataclass(frozen=True)
+class _Starts:
+    """The fits from some starts, a function of lists of arrays."""
+
+    residuals: Callable
+    options: Options
+    structure: Any
+
+    def __call__(self, shared: list, own: list) -> FitResult:
+        data, starts = jax.tree.unflatten(self.structure, [*shared, *own])
+        return jax.vmap(lambda start: solve.usual(self.residuals, self.options, start, data))(starts)
+
+
+def _by_workers(fits: _Starts, data: Data, starts: PyTree, executor: Executor, chunk: int) -> FitResult:
+    if not all_concrete((data, starts)):
+        raise TypeError(
+            "multistart: with an `executor`, all arguments must be known: call it outside jit, vmap and grad."
+        )
+    hands = require_executor("multistart", executor)
+    shared, own = ([np.asarray(x) for x in jax.tree.leaves(tree)] for tree in (data, starts))
+    chunks = Chunks(len(own[0]), require_integer("multistart", "chunk", chunk))
+    work = Work(fits, shared, lambda members: [x[members] for x in own], chunks, {})
+    return jax.device_put(collected(work, hands))
 
 
 def _check_data(caller: str, params0: PyTree, scale, weights: PyTree, prior: dict | None, tolerance: Real) -> Data:

@@ -145,7 +145,9 @@ def record_parts(residuals: Callable, coordinates: Coordinates, data: PyTree) ->
     unknowns, params0 = coordinates.x0.size + own0.size, coordinates.params(coordinates.x0)
     shapes = check_residuals("fit", every, unknowns, params0, data.starts, data.records)
     one = params0, first(data.starts), first(data.records)
-    require_own_samples("fit", residuals, jax.tree.map(lambda y: y.update(shape=y.shape[1:]), shapes), *one)
+    require_own_samples(
+        "fit", residuals, jax.tree.map(lambda y: jax.ShapeDtypeStruct(y.shape[1:], y.dtype), shapes), *one
+    )
     leaves = spread_weights("fit", data.weights, shapes)
     weights = jax.tree.unflatten(jax.tree.structure(shapes), leaves)
     w = jax.vmap(lambda x: ravel_pytree(x)[0])(weights)

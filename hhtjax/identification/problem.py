@@ -31,6 +31,7 @@ from hhtjax.xla import Programs
 if TYPE_CHECKING:
     from hhtjax.description.current import Reading
     from hhtjax.identification.gauss_newton import Seen
+    from hhtjax.identification.many_records import Many
 
 
 class _Solved(NamedTuple):
@@ -246,8 +247,10 @@ programs.add(_begin)
 
 
 @partial(Programs, static_argnums=(0, 1))
-def _see(residuals: Callable | Reading, options: Options, x: Array, params0: PyTree, data: PyTree) -> Seen:
-    """The `Seen` of x, with a `Kept`."""
+def _see(
+    residuals: Callable | Reading, options: Options, x: Array, params0: PyTree, data: PyTree, rows: tuple | None = None
+) -> Seen:
+    """The `Seen` of x, with a `Kept`. rows: what `Arrow.read` returns there, where that is known."""
     coordinates = Coordinates(options.transforms, params0, data.scale)
     p, starts = coordinates.x0.size, None
     if data.records is None:
@@ -259,7 +262,7 @@ def _see(residuals: Callable | Reading, options: Options, x: Array, params0: PyT
         parts = record_parts(residuals, coordinates, data)
         objective = Objective(parts.w.ravel(), options.loss, parts.w.size)
         problem = Arrow(parts.f, objective, data.records, p, coordinates.bend())
-        seen = problem.see(x)
+        seen = problem.seen(x, *(rows or problem.read(x)))
         residual, starts = parts.unravel(seen.read[0]), parts.unravel_start(problem.split(x)[1])
     stretch = problem.objective.stretch(seen.read[0].ravel())
     estimates = None if options.loss is None else problem.estimates(*seen.read)
@@ -337,29 +340,45 @@ def is_on_host(options: Options, *given: PyTree) -> bool:
     return is_free and options.optimizer == LEVENBERG_MARQUARDT and jax.default_backend() == "cpu"
 
 
-def solve_on_host(residuals: Callable | Reading, options: Options, params0: PyTree, data: PyTree) -> FitResult:
-    """`solve`, where nothing is being traced."""
+def solve_on_host(
+    residuals: Callable | Reading, options: Options, params0: PyTree, data: PyTree, many: Many | None = None
+) -> FitResult:
+    """`solve`, where nothing is being traced. many: who evaluates records, this process if it is None."""
     x0, w, kind = _begin(residuals, options, params0, data)
     columns = x0.size if w.ndim == 1 else kind.p + (x0.size - kind.p) // len(w)
-    if kind.chooses_steps or w.size * columns > MANY:
+    if many is None and (kind.chooses_steps or w.size * columns > MANY):
         return solve(residuals, options, params0, data)
     x0, w, warned = np.asarray(x0), np.asarray(w), np.geterr()
 
-    def see(x: np.ndarray) -> Seen:
+    def see(x: np.ndarray, rows: tuple | None = None) -> Seen:
         with np.errstate(**warned):  # the user's functions may be traced here
-            return _see(residuals, options, x, params0, data)
+            return _see(residuals, options, x, params0, data, rows)
 
-    problem = HostProblem(see) if w.ndim == 1 else HostRecords(see, kind.p, len(w))
+    if many is not None:
+        _require_equal_steps(kind)
+        problem = many.problem(residuals, options, params0, data, w, kind.p)
+    else:
+        problem = HostProblem(see) if w.ndim == 1 else HostRecords(see, kind.p, len(w))
     longest = longest_steps(options.transforms, jax.tree.leaves(params0), x0.size - kind.p)
     with np.errstate(all="ignore"):
         limits = limits_of(options, data, x0)
         best, history, iterations, code = levenberg_marquardt(problem, x0, longest, *limits)
+        if many is not None:
+            best = best._replace(read=_in_numpy(see(best.x, problem.rows(best.x))).read)
         found, kept = _solution(best, (history, iterations, code.astype(np.int32), None), kind, w, options.segments)
         if code == BAD_START:
             options = options._replace(covariance=False)  # of numbers that are not finite
         result = result_of(options, data, found, kept.params, np.asarray(kept.slope))
     numbers = {name: getattr(result, name) for name in NUMBERS}
     return result._replace(**jax.device_put(numbers))
+
+
+def _require_equal_steps(kind: Kind):
+    """An error for residuals that choose their steps: they would have to be the same for all workers."""
+    if kind.chooses_steps:
+        raise NotImplementedError(
+            "fit: with an `executor` or a `mesh`, residuals must not simulate under error control: take equal steps."
+        )
 
 
 def _solution(best, ended, kind, w, segments):

@@ -1,29 +1,43 @@
-"""Sweeps that are written to disk as they go, and taken up again where they stopped."""
+"""Sweeps, and functions of many members, that are written to disk as they go, and taken up again where they stopped."""
 
 from __future__ import annotations
 
 import hashlib
-import json
-import os
-import sys
-import zipfile
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from hhtjax.checks import require_integer
+from hhtjax.checks import require_integer, require_one_of
 from hhtjax.description import VERSION, PyTree, Real, all_concrete
 from hhtjax.runs.adaptive import Adaptive
+from hhtjax.runs.executors import IN_FLIGHT, RETRIES, Chunks, Work, require_executor, show
 from hhtjax.runs.output import require_output
+from hhtjax.runs.parallel_map import work_of
+from hhtjax.runs.storage import Names, Npz
 from hhtjax.runs.sweep import run_sweep
+from hhtjax.runs.sweep_controlled import sweep_chosen
 from hhtjax.runs.sweep_inputs import Inputs
+from hhtjax.runs.workers import written
+from hhtjax.runs.zarr_store import Zarr
 from hhtjax.steppers.stepper import Stepper
 from hhtjax.systems.events import Event
 from hhtjax.systems.system import AnySystem
+
+if TYPE_CHECKING:
+    from hhtjax.runs.executors import Hands
+    from hhtjax.runs.solution import Solution
+
+FORMATS = "npz", "zarr"
+# of `Inputs`, as `run_sweep` takes them
+ARRAYS = "system", "data", "dts", "duration", "t0", "times", "events", "output"
 
 
 def sweep_to_disk(
@@ -47,6 +61,10 @@ def sweep_to_disk(
     max_events: int = 2,
     keep_events: int = 100,
     output: Callable | None = None,
+    executor: Executor | None = None,
+    in_flight: int = IN_FLIGHT,
+    retries: int = RETRIES,
+    format: str = "npz",
 ) -> Path:
     """The same as `sweep`, `chunk` members at a time, each chunk written to a file of its own in `folder`.
 
@@ -54,14 +72,21 @@ def sweep_to_disk(
     manifest.json the numbers of members and chunks, versions, and a hash of the inputs: of all values, and of the
     program that XLA is given, so that a changed force is noticed too. A file appears with its whole content or not at
     all. A sweep that was interrupted, at whatever moment, is continued by the same call, and ends with the same files.
-    One process at a time may write to a folder.
+
+    With an executor its workers run the chunks and write the files, in any order: they need the folder, hhtjax and the
+    same JAX, and compile once each. The values are those without, bit by bit on processors of one kind. Several calls
+    with the same inputs may write to one folder at a time.
 
     Args:
         folder: made if it does not exist.
         chunk: members in a file, which bounds the memory.
-        progress: one line on stderr for each file.
+        progress: one line on stderr, rewritten with each file.
+        executor: any `concurrent.futures.Executor`, as for `parallel_map`. None: this process.
+        in_flight, retries: as for `parallel_map`.
+        format: "npz", or "zarr": `folder` is then one Zarr store with the dimensions member, sample, ..., for
+            `xarray.open_zarr`. It needs the packages of hhtjax[cluster].
         system, stepper, q0, v0, params, z0, dts, duration, num_samples, times, t0, in_axes, events, max_events,
-            keep_events, output: those of `sweep`.
+            keep_events, output: those of `sweep`; `dts` also `adaptive(...)`.
 
     Returns:
         The folder, to be read by `load_sweep`, or by `numpy.load` file by file.
@@ -69,7 +94,8 @@ def sweep_to_disk(
     Raises:
         ValueError: the folder holds a sweep of other inputs or versions.
         OSError: a file cannot be written, such as on a full disk; those before it stay, and the same call goes on.
-        TypeError, ValueError, NotImplementedError: as `sweep`; also for tracers, and for `adaptive`.
+        RuntimeError: of an executor: members failed, or a worker died; files stay, and the same call goes on.
+        TypeError, ValueError, NotImplementedError: as `sweep` and `parallel_map`; also for tracers.
 
     >>> import tempfile, jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: -4.0 * q)
@@ -81,152 +107,167 @@ def sweep_to_disk(
     >>> found["q"].shape                                                             # members, samples, coordinates
     (3, 6, 1)
     """
-    chunk = require_integer("sweep_to_disk", "chunk", chunk)
-    if isinstance(dts, Adaptive):
-        raise NotImplementedError("sweep_to_disk: `dts` must be step sizes; adaptive(...) is for `sweep`.")
+    caller = "sweep_to_disk"
+    chunk = require_integer(caller, "chunk", chunk)
     grid = {"duration": duration, "num_samples": num_samples, "times": times, "t0": t0}
     inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
-    inputs = inputs.with_events(events, max_events, keep_events)._replace(
-        output=require_output("sweep_to_disk", output)
-    )
+    inputs = inputs.with_events(events, max_events, keep_events)._replace(output=require_output(caller, output))
     if not all_concrete(inputs):
         raise TypeError("sweep_to_disk: all arguments must be known: call it outside jit, vmap and grad.")
-    folder, size = Path(folder), inputs.dts.size
-    places = np.minimum(np.arange(-(-size // chunk) * chunk), size - 1).reshape(-1, chunk)  # the last one fills up
-    arguments, keywords = inputs.chunk(places[0]).call()
-    lowered = run_sweep.lower(*arguments, **keywords)
-    _claim(folder, _manifest(inputs, lowered, chunk, len(places)))
-    for number, members in enumerate(places):
-        path = folder / f"chunk-{number:05d}.npz"
-        if not _is_whole(path):
-            runs = run_sweep(*inputs.chunk(members).call()[0], **keywords)
-            kept = min(chunk, size - number * chunk)
-            _write(path, lambda file, runs=runs, kept=kept: np.savez(file, **_named(runs, kept)))
-        if progress:
-            print(f"[chunk {number + 1} of {len(places)}] {path}", file=sys.stderr, flush=True)
+    hands = require_executor(caller, executor, in_flight, retries, progress)
+    require_one_of(caller, "format", format, FORMATS)
+    by_errors = isinstance(inputs.dts, Adaptive)
+    shortened = ("dt", "steps.dt") if by_errors else ()
+    return _store(
+        caller, Path(folder), format, _work(inputs, chunk), hands, progress, shortened, "sample", inputs.num_samples + 1
+    )
+
+
+def map_to_disk(
+    folder: str | Path,
+    f: Callable[..., Any],
+    *arguments: PyTree,
+    executor: Executor | None = None,
+    chunk: int,
+    in_axes: Any = 0,
+    in_flight: int = IN_FLIGHT,
+    retries: int = RETRIES,
+    progress: bool = False,
+    format: str = "npz",
+) -> Path:
+    """`parallel_map`, each chunk written to a file of its own in `folder`: for what takes hours, or more than memory.
+
+    Interrupted at any moment, it is continued by the same call. Files are as those of `sweep_to_disk`, by the names of
+    the leaves of what f returns: "a.b" of {"a": {"b": ...}}, "result" of an array by itself.
+
+    Args:
+        folder: made if it does not exist.
+        format: as for `sweep_to_disk`.
+        f, arguments, executor, chunk, in_axes, in_flight, retries, progress: those of `parallel_map`.
+
+    Returns:
+        The folder, to be read by `load_sweep`.
+
+    Raises:
+        ValueError: the folder holds something of other inputs or versions.
+        OSError: a file cannot be written; those before it stay, and the same call goes on.
+        TypeError, ValueError, NotImplementedError, RuntimeError: as `parallel_map`.
+
+    >>> import tempfile, jax.numpy as jnp, hhtjax
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     where = hhtjax.map_to_disk(folder, lambda x: {"square": x**2}, jnp.arange(5.0), chunk=2)
+    ...     print(hhtjax.load_sweep(where)["square"])
+    [ 0.  1.  4.  9. 16.]
+    """
+    caller = "map_to_disk"
+    work = work_of(caller, f, arguments, in_axes, chunk)
+    hands = require_executor(caller, executor, in_flight, retries, progress)
+    require_one_of(caller, "format", format, FORMATS)
+    return _store(caller, Path(folder), format, work, hands, progress)
+
+
+def _store(
+    caller: str,
+    folder: Path,
+    format: str,
+    work: Work,
+    hands: Hands | None,
+    progress: bool,
+    shortened: tuple = (),
+    axis: str | None = None,
+    length: int = 0,
+) -> Path:
+    """Writes what is not there yet. shortened: names of arrays whose last axis ends with the most steps of a chunk;
+    axis: the name of second axes of this length."""
+    chunks, paths = work.chunks, jax.tree_util.tree_leaves_with_path(work.like())
+    names = Names(tuple(jax.tree_util.keystr(path, simple=True, separator=".") or "result" for path, _ in paths))
+    like = [x for _, x in paths]
+    inputs = _hash(work)
+    manifest = {"inputs": inputs, "members": chunks.size, "chunk": chunks.length, "chunks": chunks.number}
+    manifest["versions"] = {"hhtjax": VERSION, "jax": version("jax"), "numpy": np.__version__}
+    if format == "zarr":
+        dims = tuple(_dims(name, x.shape, axis, length) for name, x in zip(names.all, like, strict=True))
+        store = Zarr(caller, folder, inputs, names, dims, chunks.length)
+        store.begin(manifest, like)
+    else:
+        if shortened:
+            names = names._replace(shortened=tuple(x for x in shortened if x in names.all), by="steps.accepted")
+            manifest["shortened"] = list(names.shortened)
+        store = Npz(caller, folder, inputs, names)
+        store.begin(manifest)
+    left = [k for k in range(chunks.number) if not store.holds(k)]
+    if hands is None:
+        for done, k in enumerate(left, 1):
+            store.write(k, chunks.kept(k), work.here(k))
+            if progress:
+                show(done, len(left))
+    elif left:
+        program = work.packed(caller)
+        hands.work(
+            written,
+            chunks,
+            left,
+            lambda k: (program, work.arrays(k), partial(store.write, k, chunks.kept(k))),
+            lambda k, result: None,
+        )
+    store.end()
     return folder
 
 
-def load_sweep(folder: str | Path) -> dict[str, np.ndarray]:
-    """What `sweep_to_disk` wrote: the leaves of the `Solution` by name, members first.
-
-    Args:
-        folder: where `sweep_to_disk` wrote to.
-
-    Returns:
-        Arrays by name: "t", "q", "v", "dt", "failure.step", ...; their first axis is that of the members.
-
-    Raises:
-        FileNotFoundError: the folder holds no sweep, or a chunk is missing, because the sweep is not finished.
-        ValueError: a file is damaged.
-
-    >>> import hhtjax
-    >>> hhtjax.load_sweep("no such folder")  # doctest: +IGNORE_EXCEPTION_DETAIL
-    Traceback (most recent call last):
-    FileNotFoundError: ...
-    """
-    folder = Path(folder)
-    manifest = folder / "manifest.json"
-    if not manifest.is_file():
-        raise FileNotFoundError(f"load_sweep: `folder` must hold a sweep; received {folder}, without a manifest.json.")
-    chunks = _read(manifest).get("chunks")
-    if not isinstance(chunks, int):
-        raise ValueError(f"load_sweep: {manifest} is damaged: make the sweep anew in another folder.")
-    paths = [folder / f"chunk-{number:05d}.npz" for number in range(chunks)]
-    missing = [path.name for path in paths if not path.exists()]
-    if missing:
-        raise FileNotFoundError(
-            f"load_sweep: {len(missing)} of {chunks} chunks are missing in {folder}, the first is {missing[0]}: "
-            "repeat the call of sweep_to_disk, which goes on where it stopped."
-        )
-    parts = []
-    for path in paths:
-        try:
-            with open(path, "rb") as file, np.load(file) as part:
-                parts.append(dict(part))
-        except (ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(
-                f"load_sweep: {path} is damaged ({error}): repeat the call of sweep_to_disk, which makes it anew."
-            ) from error
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+def _dims(name: str, shape: tuple, axis: str | None, length: int) -> tuple[str, ...]:
+    """Names of the axes behind that of the members."""
+    names = [f"{name}_{i}" for i in range(1, len(shape))]
+    return (axis, *names[1:]) if axis is not None and shape[1:2] == (length,) else tuple(names)
 
 
-def _named(runs, kept) -> dict[str, Any]:
-    """The first members' leaves as NumPy arrays."""
-    leaves = jax.tree_util.tree_leaves_with_path(runs)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(x)[:kept] for path, x in leaves}
-
-
-def _manifest(inputs, lowered, chunk, chunks):
-    digest = hashlib.sha256(lowered.as_text().encode())
-    for x in jax.tree.leaves(inputs):
-        x = np.asarray(x)
+def _hash(work: Work) -> str:
+    """Of the program and all that it is called with."""
+    digest = hashlib.sha256(work.text().encode())
+    for x in [*work.shared, *work.own(np.arange(work.chunks.size))]:
         digest.update(f"{x.shape} {x.dtype}".encode() + x.tobytes())
-    return {
-        "inputs": digest.hexdigest(),
-        "members": int(inputs.dts.size),
-        "chunk": chunk,
-        "chunks": chunks,
-        "versions": {"hhtjax": VERSION, "jax": version("jax"), "numpy": np.__version__},
-    }
+    digest.update(f"{work.chunks.length}".encode())
+    return digest.hexdigest()
 
 
-def _claim(folder, manifest):
-    """Writes the manifest, or compares it with the one that is there."""
-    path = folder / "manifest.json"
-    if not path.exists():
-        if stray := sorted(folder.glob("chunk-*.npz")):
-            raise ValueError(
-                f"sweep_to_disk: `folder` {folder} holds {stray[0].name}, but no manifest.json that tells of which "
-                "sweep: nothing was changed there; choose another folder, or empty it."
-            )
-        folder.mkdir(parents=True, exist_ok=True)
-        _write(path, lambda file: file.write(json.dumps(manifest, indent=1).encode() + b"\n"))
-        return
-    found = _read(path)
-    differ = [key for key in manifest if found.get(key) != manifest[key]]
-    if differ:
-        raise ValueError(
-            f"sweep_to_disk: `folder` {folder} holds another sweep, whose {', '.join(differ)} differ: nothing was "
-            "changed there; choose another folder, or the inputs that it was begun with."
-        )
+# ----------------------------------------------------------------------------
+# A sweep as a function of lists of arrays.
 
 
-def _read(path):
-    """A manifest; nothing of one that is damaged."""
-    try:
-        found = json.loads(path.read_text())
-    except ValueError:
-        return {}
-    return found if isinstance(found, dict) else {}
+def _work(inputs: Inputs, chunk: int) -> Work:
+    """The `Work` of a sweep."""
+    chunks = Chunks(inputs.size, chunk)
+    by_errors = isinstance(inputs.dts, Adaptive)
+    if by_errors:
+        static, fitting = {}, {"rates": inputs.sizes()[1]}
+    else:
+        _, static = inputs.chunk(chunks.members(0)).call()
+        fitting = {name: static.pop(name) for name in ("rates", "numbers")}
+    tree = tuple(getattr(inputs, name) for name in ARRAYS)
+    leaves, structure = jax.tree.flatten(tree)
+    of_dts = [jnp.ndim(x) > 0 for x in jax.tree.leaves(inputs.dts)]
+    behind = jax.tree.leaves(tree[3:])
+    mapped = [False] * len(jax.tree.leaves(inputs.system)) + [*inputs.mapped, *of_dts] + [False] * len(behind)
+    arrays = [np.asarray(x) for x in leaves]
+    shared = [x for x, flag in zip(arrays, mapped, strict=True) if not flag]
+    of_members = [x for x, flag in zip(arrays, mapped, strict=True) if flag]
+    rest = inputs._replace(size=chunk, **dict.fromkeys(ARRAYS))
+    f = _Swept(structure, tuple(mapped), tuple(rest), tuple(sorted(static.items())), by_errors)
+    return Work(f, shared, lambda members: [x[members] for x in of_members], chunks, fitting)
 
 
-def _is_whole(path):
-    """Whether a chunk is there and can be read, by the checksums inside it."""
-    try:
-        with zipfile.ZipFile(path) as file:
-            return file.testzip() is None
-    except (OSError, zipfile.BadZipFile):
-        return False
+@dataclass(frozen=True)
+class _Swept:
+    """The `Solution` of a chunk. rest: what of `Inputs` are no arrays; static: keywords of `run_sweep`."""
 
+    structure: Any
+    mapped: tuple
+    rest: tuple
+    static: tuple
+    by_errors: bool
 
-def _write(path, fill):
-    """A file that is there with its whole content, also after a power cut, or not at all."""
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        with open(temporary, "wb") as file:
-            fill(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        if os.name == "posix":
-            descriptor = os.open(path.parent, os.O_RDONLY)
-            os.fsync(descriptor)
-            os.close(descriptor)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OSError(
-            error.errno,
-            f"sweep_to_disk: {path} could not be written ({error.strerror}); the files before it are whole: "
-            "make room, and repeat the call, which goes on where it stopped",
-        ) from error
+    def __call__(self, shared: list, own: list) -> Solution:
+        parts = iter(shared), iter(own)
+        tree = jax.tree.unflatten(self.structure, [next(parts[flag]) for flag in self.mapped])
+        if not self.by_errors:
+            return run_sweep.usual(*tree, **dict(self.static))
+        return sweep_chosen(Inputs(*self.rest)._replace(**dict(zip(ARRAYS, tree, strict=True))), False)

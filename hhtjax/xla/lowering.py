@@ -15,6 +15,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.export
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 from jax.interpreters import mlir
@@ -162,6 +163,15 @@ class Programs:
     def lower(self, *args: PyTree, rates: int = 0, numbers: int | None = None, **keywords: PyTree):
         """What a call hands to XLA, as `jax.jit(f).lower`."""
         return self._chosen(lambda program: program.lower(*args, **keywords), rates, numbers)
+
+    def exported(self, *args: PyTree, rates: int = 0, numbers: int | None = None, **keywords: PyTree):
+        """The same in a form that crosses to other processes (`jax.export`), and the options to compile it with."""
+
+        def use(program):
+            options = {id(self.wide): QUICK | WIDE, id(self.quick): QUICK, id(self.usual): {}}
+            return jax.export.export(program)(*args, **keywords), options[id(program)]
+
+        return self._chosen(use, rates, numbers)
 
     def _chosen(self, use: Callable, rates: int, numbers: int | None):
         program = self.of(rates, numbers)

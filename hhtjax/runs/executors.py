@@ -1,0 +1,220 @@
+"""Members of a batch, some at a time, handed to any executor of the standard library's kind.
+
+A task is a chunk of members: their arrays, and the program, which a worker compiles once (workers.py). So many tasks
+are handed out ahead; one that fails is tried again; those that are not begun are taken back when the caller is
+interrupted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import BrokenExecutor, Executor, Future
+from dataclasses import dataclass
+from functools import partial
+from queue import Empty, SimpleQueue
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from hhtjax.checks import require_integer
+from hhtjax.description import PyTree
+from hhtjax.description.presentation import overwrite
+from hhtjax.runs.workers import Packed, Unfit, packed, results
+from hhtjax.xla import Programs
+
+IN_FLIGHT, RETRIES = 1000, 2
+PATIENCE = 0.5  # s, after which a caller that waits looks whether it has been interrupted
+
+
+@partial(Programs, static_argnums=0)
+def _run(f: Callable, shared: list, own: list) -> PyTree:
+    return f(shared, own)
+
+
+@partial(Programs, static_argnums=0)
+def _leaves(f: Callable, shared: list, own: list) -> list:
+    return jax.tree.leaves(_run.usual(f, shared, own))
+
+
+class Chunks(NamedTuple):
+    """Members 0, 1, ... size - 1, so many at a time. The last chunk repeats the last member."""
+
+    size: int
+    length: int
+
+    @property
+    def number(self) -> int:
+        """Of chunks."""
+        return -(-self.size // self.length)
+
+    def members(self, k: int) -> np.ndarray:
+        """Of a chunk, (length,)."""
+        return np.minimum(np.arange(k * self.length, (k + 1) * self.length), self.size - 1)
+
+    def kept(self, k: int) -> int:
+        """How many members of a chunk are its own."""
+        return min(self.length, self.size - k * self.length)
+
+    def named(self, k: int) -> str:
+        """For messages."""
+        first, last = k * self.length, k * self.length + self.kept(k) - 1
+        return f"member {first}" if first == last else f"members {first} to {last}"
+
+
+class Work(NamedTuple):
+    """A function f(shared, own) of lists of arrays, hashable, and what it is called with for each chunk.
+
+    own: numbers of members -> theirs; fitting: of the system in it, by which `Programs` choose."""
+
+    f: Callable
+    shared: list
+    own: Callable[[np.ndarray], list]
+    chunks: Chunks
+    fitting: dict[str, Any]
+
+    def arrays(self, k: int) -> list:
+        """Those of a chunk."""
+        return self.own(self.chunks.members(k))
+
+    def like(self) -> PyTree:
+        """What it returns: shapes and dtypes."""
+        return jax.eval_shape(partial(_run.usual, self.f), self.shared, self.arrays(0))
+
+    def here(self, k: int) -> list[np.ndarray]:
+        """The leaves of what it returns for a chunk, by this process."""
+        return [np.asarray(x) for x in _leaves(self.f, self.shared, self.arrays(k), **self.fitting)]
+
+    def text(self) -> str:
+        """What XLA is given, by which one program is told from another."""
+        return _leaves.lower(self.f, self.shared, self.arrays(0), **self.fitting).as_text()
+
+    def packed(self, caller: str) -> Packed:
+        """For workers."""
+        try:
+            exported, options = _leaves.exported(self.f, self.shared, self.arrays(0), **self.fitting)
+            return packed(exported, self.shared, options)
+        except (NotImplementedError, ValueError) as error:
+            if "callback" not in str(error):
+                raise
+            raise NotImplementedError(
+                f"{caller}: with an `executor`, no function may call back to Python, which cannot cross: "
+                "leave out progress=True, and sparse systems, whose equations SciPy solves; or leave out `executor`."
+            ) from error
+
+
+@dataclass(frozen=True)
+class Hands:
+    """Who works, and how they are treated; made by `require_executor`."""
+
+    caller: str
+    executor: Executor
+    in_flight: int
+    retries: int
+    progress: bool
+
+    def work(self, task: Callable, chunks: Chunks, these: Iterable[int], arguments: Callable, take: Callable):
+        """task(*arguments(k)) for each of these chunks k, and take(k, result) as they come."""
+        waiting, flying, tries = deque(these), {}, Counter()
+        ended: SimpleQueue[Future] = SimpleQueue()
+        total, done = len(waiting), 0
+        try:
+            while waiting or flying:
+                while waiting and len(flying) < self.in_flight:
+                    k = waiting.popleft()
+                    future = self._submitted(chunks.named(k), task, *arguments(k))
+                    flying[future] = k
+                    future.add_done_callback(ended.put)
+                future = _next(ended)
+                k = flying.pop(future)
+                try:
+                    found = future.result()
+                except Exception as error:
+                    tries[k] += 1
+                    self._require_another(chunks.named(k), error, tries[k])
+                    waiting.append(k)
+                    continue
+                take(k, found)
+                done += 1
+                if self.progress:
+                    show(done, total)
+        finally:
+            for future in flying:
+                future.cancel()
+
+    def _submitted(self, members: str, task: Callable, *arguments: Any) -> Future:
+        try:
+            return self.executor.submit(task, *arguments)
+        except BrokenExecutor as error:
+            raise self._died(members) from error
+
+    def _require_another(self, members: str, error: Exception, tries: int):
+        """An error unless a task that failed may be tried again."""
+        if isinstance(error, BrokenExecutor):
+            raise self._died(members) from error
+        if isinstance(error, Unfit):
+            raise RuntimeError(f"{self.caller}: {error}") from error
+        if tries > self.retries:
+            words = f"{self.caller}: {members} failed {tries} times, at last by {type(error).__name__}: {error}"
+            if isinstance(error, OSError):
+                raise OSError(error.errno, words) from error
+            raise RuntimeError(words) from error
+
+    def _died(self, members: str) -> RuntimeError:
+        return RuntimeError(
+            f"{self.caller}: a worker died at {members}, or beside them: killed, often because memory ran out (a "
+            "smaller `chunk` takes less). This executor is broken: make another one, and repeat the call."
+        )
+
+
+def _next(ended: SimpleQueue) -> Future:
+    """The next that has ended; interruptions come through."""
+    while True:
+        try:
+            return ended.get(timeout=PATIENCE)
+        except Empty:
+            continue
+
+
+def require_executor(
+    caller: str, executor: Any, in_flight: int = IN_FLIGHT, retries: int = RETRIES, progress: bool = False
+) -> Hands | None:
+    """The `Hands`; None without an executor."""
+    in_flight = require_integer(caller, "in_flight", in_flight)
+    retries = require_integer(caller, "retries", retries, least=0)
+    if executor is None:
+        return None
+    if not callable(getattr(executor, "submit", None)):
+        raise TypeError(
+            f"{caller}: `executor` must be a concurrent.futures.Executor, such as ProcessPoolExecutor(...), Dask's "
+            f"client.get_executor() or MPIPoolExecutor(); received {executor!r}."
+        )
+    return Hands(caller, executor, in_flight, retries, progress)
+
+
+def collected(work: Work, hands: Hands | None, progress: bool = False, program: Packed | None = None) -> PyTree:
+    """The results of all members, in arrays of NumPy, by the hands, or by this process. program: for the hands."""
+    leaves, structure = jax.tree.flatten(work.like())
+    chunks = work.chunks
+    found = [np.empty((chunks.size, *x.shape[1:]), x.dtype) for x in leaves]
+
+    def take(k: int, arrays: list):
+        start, kept = k * chunks.length, chunks.kept(k)
+        for x, y in zip(found, arrays, strict=True):
+            x[start : start + kept] = y[:kept]
+
+    if hands is not None:
+        program = program or work.packed(hands.caller)
+        hands.work(results, chunks, range(chunks.number), lambda k: (program, work.arrays(k)), take)
+    else:
+        for k in range(chunks.number):
+            take(k, work.here(k))
+            if progress:
+                show(k + 1, chunks.number)
+    return jax.tree.unflatten(structure, found)
+
+
+def show(done: int, total: int):
+    """The bar."""
+    overwrite(f"[{'#' * (done * 40 // total):<40}] chunk {done} of {total}", last=done == total)

@@ -1,0 +1,133 @@
+"""Results of many members in a folder: a file for each chunk, to which many processes may write.
+
+A file is there as a whole or not at all. It bears its number and the hash of what it was made from, so that no other
+one is taken for it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import uuid
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+MANIFEST = "manifest.json"
+NUMBER, INPUTS = "chunk.number", "chunk.inputs"  # in a file, beside the arrays
+
+
+class Names(NamedTuple):
+    """Of the arrays of a chunk. shortened, by: those whose last axis is as long as the largest number in another."""
+
+    all: tuple[str, ...]
+    shortened: tuple[str, ...] = ()
+    by: str | None = None
+
+    def given(self, arrays: Sequence[np.ndarray], kept: int) -> dict[str, np.ndarray]:
+        """The arrays of the first members, by name."""
+        found = {name: x[:kept] for name, x in zip(self.all, arrays, strict=True)}
+        if self.by is not None:
+            longest = int(np.max(found[self.by], initial=0))
+            found |= {name: found[name][..., :longest] for name in self.shortened}
+        return found
+
+
+class Npz(NamedTuple):
+    """A folder of files of NumPy. inputs: the hash of what the members are made from."""
+
+    caller: str
+    folder: Path
+    inputs: str
+    names: Names
+
+    def path(self, k: int) -> Path:
+        """Of a chunk."""
+        return self.folder / f"chunk-{k:05d}.npz"
+
+    def holds(self, k: int) -> bool:
+        """Whether a chunk is there and can be read, by the checksums inside it, and is the one that belongs there."""
+        try:
+            with zipfile.ZipFile(self.path(k)) as file:
+                if file.testzip() is not None:
+                    return False
+            with np.load(self.path(k)) as part:
+                return is_chunk(part, k, self.inputs)
+        except (OSError, ValueError, zipfile.BadZipFile):
+            return False
+
+    def write(self, k: int, kept: int, arrays: Sequence[np.ndarray]):
+        """A chunk; where another process has written it meanwhile, its file is replaced by the same."""
+        marks = {NUMBER: np.asarray(k), INPUTS: np.asarray(self.inputs)}
+        named = self.names.given(arrays, kept)
+        write_whole(self.caller, self.path(k), lambda file: np.savez(file, **named, **marks))
+
+    def begin(self, manifest: dict[str, Any]):
+        """Writes the manifest, or compares it with the one that is there."""
+        path = self.folder / MANIFEST
+        if not path.exists():
+            if stray := sorted(self.folder.glob("chunk-*.npz")):
+                raise ValueError(
+                    f"{self.caller}: `folder` {self.folder} holds {stray[0].name}, but no {MANIFEST} that tells of "
+                    "which sweep: nothing was changed there; choose another folder, or empty it."
+                )
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_whole(self.caller, path, lambda file: file.write(json.dumps(manifest, indent=1).encode() + b"\n"))
+            return
+        require_same(self.caller, self.folder, read_manifest(path), manifest)
+
+    def end(self):
+        """Removes what workers that died have left."""
+        for path in self.folder.glob(".chunk-*.part"):
+            path.unlink(missing_ok=True)
+
+
+def require_same(caller: str, folder: Path, found: Mapping[str, Any], manifest: dict[str, Any]):
+    """An error unless what a folder holds was begun with the same inputs and versions."""
+    if differ := [key for key in manifest if found.get(key) != manifest[key]]:
+        raise ValueError(
+            f"{caller}: `folder` {folder} holds another sweep, whose {', '.join(differ)} differ: nothing was "
+            "changed there; choose another folder, or the inputs that it was begun with."
+        )
+
+
+def write_whole(caller: str, path: Path, fill: Callable[[Any], Any]):
+    """A file that is there with its whole content, also after a power cut, or not at all."""
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.part")
+    try:
+        with open(temporary, "wb") as file:
+            fill(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        if os.name == "posix":
+            descriptor = os.open(path.parent, os.O_RDONLY)
+            os.fsync(descriptor)
+            os.close(descriptor)
+    except FileNotFoundError:
+        if not path.exists():  # else another writer was done, and its caller has tidied up
+            raise
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OSError(
+            error.errno,
+            f"{caller}: {path} could not be written ({error.strerror}); the files before it are whole: "
+            "make room, and repeat the call, which goes on where it stopped",
+        ) from error
+
+
+def is_chunk(part: Mapping[str, np.ndarray], k: int, inputs: str | None) -> bool:
+    """Whether a file says that it is this chunk of this sweep."""
+    return NUMBER in part and int(part[NUMBER]) == k and str(part[INPUTS]) == inputs
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """A manifest; nothing of one that is damaged."""
+    try:
+        found = json.loads(path.read_text())
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,117 @@
+"""What a worker of an executor does: it keeps programs, each compiled once, and runs them on the arrays it is sent.
+
+A program crosses as what `jax.export` makes of it. Nothing of the user's has to be importable on a worker, which needs
+hhtjax and the same JAX.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import threading
+import zlib
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hhtjax.description import VERSION
+
+MOST = 16  # programs that a worker keeps
+IMPORTED_BY = os.getpid()  # another one's in a process that was forked afterwards, in which JAX would wait for ever
+
+_kept: OrderedDict[str, Callable] = OrderedDict()
+_lock = threading.Lock()
+
+
+class Unfit(RuntimeError):
+    """A worker that cannot run what it is sent, however often it is asked."""
+
+
+class Packed(NamedTuple):
+    """A program on its way. key: its hash, by which a worker knows it; content: bytes, with the arrays that all chunks
+    share."""
+
+    key: str
+    content: bytes
+
+
+class _Content(NamedTuple):
+    program: bytes  # of jax.export
+    shared: list
+    options: dict  # of the compiler
+    x64: bool
+    platform: str
+    versions: dict
+
+
+def versions() -> dict[str, str]:
+    """Of what has to be the same on both sides."""
+    return {"jax": jax.__version__, "hhtjax": VERSION}
+
+
+def packed(exported: jax.export.Exported, shared: list, options: dict) -> Packed:
+    """A program of lists, (shared, own) -> leaves, with the first of them."""
+    x64, platform = jnp.result_type(float) == np.float64, exported.platforms[0]
+    content = _Content(bytes(exported.serialize()), shared, options, x64, platform, versions())
+    data = zlib.compress(pickle.dumps(tuple(content)))
+    return Packed(hashlib.sha256(data).hexdigest(), data)
+
+
+def results(program: Packed, own: list) -> list[np.ndarray]:
+    """On a worker: what the program makes of the arrays of a chunk."""
+    return _here(program)(own)
+
+
+def written(program: Packed, own: list, write: Callable[[list], None]):
+    """The same, handed to a function that writes it where the worker is."""
+    write(results(program, own))
+
+
+def _here(program: Packed) -> Callable:
+    """It, compiled in this process; threads wait for one of them to do so."""
+    if os.getpid() != IMPORTED_BY:
+        raise Unfit(
+            "a worker process was forked from one that had loaded JAX, which does not work: make the executor with "
+            'ProcessPoolExecutor(..., mp_context=multiprocessing.get_context("spawn")).'
+        )
+    with _lock:
+        if program.key not in _kept:
+            _kept[program.key] = _compiled(_Content(*pickle.loads(zlib.decompress(program.content))))
+            while len(_kept) > MOST:
+                _kept.popitem(last=False)
+        _kept.move_to_end(program.key)
+        return _kept[program.key]
+
+
+def _compiled(content: _Content) -> Callable:
+    """Arrays of a chunk -> results."""
+    if content.versions != versions():
+        raise Unfit(f"a worker must have the caller's versions, {content.versions}; it has {versions()}.")
+    if jax.default_backend() != content.platform:
+        raise Unfit(
+            f"a worker must compute on the caller's platform, {content.platform!r}; its JAX takes "
+            f"{jax.default_backend()!r}: set JAX_PLATFORMS there."
+        )
+    exported = jax.export.deserialize(bytearray(content.program))
+    with _bits(content.x64):
+        like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in exported.in_avals]
+        arguments, _ = jax.tree.unflatten(exported.in_tree, like)
+        call = jax.jit(exported.call, compiler_options=content.options).lower(*arguments).compile()
+        shared = jax.device_put(content.shared)
+
+    def run(own: list) -> list[np.ndarray]:
+        with _bits(content.x64):
+            return [np.asarray(x) for x in call(shared, own)]
+
+    return run
+
+
+def _bits(x64: bool):
+    """A context in which JAX has 64 bits, or not, by the name that this JAX has for it."""
+    context = jax.enable_x64 if hasattr(jax, "enable_x64") else jax.experimental.enable_x64
+    return context(x64)
