@@ -11,6 +11,7 @@ for requirement in [
     *extras["plot"],
     *extras["experiments"],
     *extras["interop"],
+    *extras["cluster"],
     *extras["test"],
 ]:
     match = re.fullmatch(r"([a-z-]+)>=([\d.]+)", requirement)

@@ -163,7 +163,7 @@ def test_keys_trees_and_dtypes_cross(threads):
         found, small = hhtjax.parallel_map(
             draw, keys, scale, chunk=2, in_axes=(0, {"a": 0, "b": None}), executor=executor
         )
-        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
         assert (found.dtype, small.dtype, small.shape) == (np.float32, np.int8, (5,))
 
 
@@ -390,3 +390,52 @@ def test_all_kinds_of_sweeps_cross(threads, tmp_path, name):
     assert expected.keys() == alone.keys()
     for key, x in expected.items():
         np.testing.assert_allclose(alone[key], x, rtol=1e-12, err_msg=key)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("xarray") is None, reason="zarr and xarray are not installed")
+@pytest.mark.parametrize("name", ["error control", "output"])
+def test_a_zarr_store_holds_the_same_and_xarray_opens_it(threads, tmp_path, name):
+    import xarray
+
+    start, sweep = KINDS[name]
+    files = hhtjax.load_sweep(hhtjax.sweep_to_disk(tmp_path / "files", *start, **sweep, chunk=3))
+    options = {"chunk": 3, "executor": threads, "format": "zarr"}
+    where = hhtjax.sweep_to_disk(tmp_path / "store", *start, **sweep, **options)
+    arrays, lazy = hhtjax.load_sweep(where), hhtjax.load_sweep(where, lazy=True)
+    for key, x in files.items():
+        there = arrays[key][tuple(slice(n) for n in x.shape)]  # steps are as many as max_steps there
+        np.testing.assert_array_equal(there, x, err_msg=key)
+        np.testing.assert_array_equal(lazy[key][2:5], arrays[key][2:5])
+    with xarray.open_zarr(where) as found:
+        variable = found["output" if name == "output" else "q"]
+        assert variable.dims[:2] == ("member", "sample")
+        assert found["t"].attrs["units"] == "s"
+        assert "t" in found.coords
+        np.testing.assert_array_equal(variable.isel(member=slice(2, 4)).values, arrays[variable.name][2:4])
+    with pytest.raises(ValueError, match=r"holds another sweep, whose inputs differ"):
+        hhtjax.sweep_to_disk(where, *start, **(sweep | {"duration": 1.1}), **options)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("zarr") is None, reason="zarr is not installed")
+def test_a_zarr_store_is_continued(threads, tmp_path):
+    import zarr
+
+    x = np.arange(10.0)
+    where = hhtjax.map_to_disk(tmp_path / "store", jnp.sin, x, chunk=4, format="zarr")
+    group = zarr.open_group(where, mode="r+")
+    group["result"][4:8], group["chunk_written"][1] = 0, False
+    with pytest.raises(FileNotFoundError, match="1 of 3 chunks are missing in .*, the first is number 1"):
+        hhtjax.load_sweep(where)
+    hhtjax.map_to_disk(where, jnp.sin, x, chunk=4, format="zarr", executor=threads)
+    np.testing.assert_allclose(hhtjax.load_sweep(where)["result"], np.sin(x), rtol=1e-14)
+    with pytest.raises(ValueError, match="must be empty, or hold this sweep as a Zarr store"):
+        hhtjax.map_to_disk(tmp_path, jnp.sin, x, chunk=4, format="zarr")
+    with pytest.raises(ValueError, match="`format` must be one of 'npz', 'zarr'; received 'csv'"):
+        hhtjax.map_to_disk(tmp_path / "csv", jnp.sin, x, chunk=4, format="csv")
+
+
+def test_a_zarr_store_needs_its_package(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(ImportError, match=r"map_to_disk: a Zarr store needs the package zarr: pip install"):
+        hhtjax.map_to_disk(tmp_path / "store", jnp.sin, K, chunk=4, format="zarr")

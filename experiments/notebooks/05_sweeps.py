@@ -165,10 +165,10 @@ assert apart < 1e-12
 
 
 # %%
-def to_disk(folder):
+def to_disk(folder, **options):
     return hhtjax.sweep_to_disk(
         folder, scene.system, hhtjax.hht(), scene.q0, scene.v0, stiffened(all_k), dts=all_dts,
-        duration=DURATION, num_samples=SAMPLES, in_axes=AXES, chunk=200,
+        duration=DURATION, num_samples=SAMPLES, in_axes=AXES, chunk=200, **options,
     )  # fmt: skip
 
 
@@ -184,6 +184,25 @@ with tempfile.TemporaryDirectory() as temporary:
     print("members in the manifest:", json.loads((folder / "manifest.json").read_text())["members"])
 print("leaves:", ", ".join(sorted(loaded)))
 print("equal to the sweep in memory, to", float(np.abs(loaded["q"] - runs.q).max()), "rad")
+
+# %% [markdown]
+# ## By other processes
+#
+# `executor=` hands the chunks to the workers of any executor of Python's standard library's kind. Here they are two
+# processes of this machine; on a cluster they are Dask's or MPI's. Workers are sent the compiled program, not the functions of
+# this notebook, so nothing has to be importable there. The files are the same, bit by bit.
+
+# %%
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+
+with tempfile.TemporaryDirectory() as temporary:
+    alone = hhtjax.load_sweep(to_disk(Path(temporary) / "alone"))
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as executor:
+        shared = hhtjax.load_sweep(to_disk(Path(temporary) / "shared", executor=executor))
+equal = all(np.array_equal(alone[name], shared[name]) for name in alone)
+print("two processes, bitwise equal:", equal)
+assert equal
 
 # %% [markdown]
 # ## What to try next

@@ -45,8 +45,10 @@ class Many(NamedTuple):
         structure = jax.tree.structure((params0, shared, records))
         given = [np.asarray(x) for x in jax.tree.leaves((params0, shared))]
         of_records = [w, *(np.asarray(x) for x in jax.tree.leaves(records))]
-        evaluate = _Records(residuals, options, structure)
-        by = [self._evaluated(evaluate._replaced(rows), given, of_records, len(w), p) for rows in (False, True)]
+        by = [
+            self._evaluated(_Records(residuals, options, structure, rows), given, of_records, len(w), p)
+            for rows in (False, True)
+        ]
         return ManyRecords(*by, p, w.shape)
 
     def _evaluated(self, f: _Records, shared: list, of_records: list, count: int, p: int) -> Callable:
@@ -56,17 +58,17 @@ class Many(NamedTuple):
         def own_at(x: np.ndarray, members: np.ndarray) -> list:
             return [x[:p], x[p:].reshape(count, -1)[members], *(y[members] for y in of_records)]
 
-        work = Work(f, shared, partial(own_at, np.zeros(p + count * 0)), Chunks(count, length), {})
-        packed: list = []
+        chunks = Chunks(count, length)
+        packed: list = []  # the program, which is the same for all x
 
         def at(x: np.ndarray) -> PyTree:
-            now = work._replace(own=partial(own_at, x))
+            work = Work(f, shared, partial(own_at, x), chunks, {})
             if self.mesh is not None:
-                found = _on_mesh(f, self.mesh, shared, now.arrays(0))
+                found = _on_mesh(f, self.mesh, shared, work.arrays(0))
                 return jax.tree.map(lambda y: np.asarray(y)[:count], found)
             if not packed:
-                packed.append(now.packed("fit"))
-            return collected(now, self.hands, program=packed[0])
+                packed.append(work.packed("fit"))
+            return collected(work, self.hands, program=packed[0])
 
         return at
 
@@ -78,10 +80,7 @@ class _Records:
     residuals: Callable | Reading
     options: Options
     structure: Any
-    rows: bool = False
-
-    def _replaced(self, rows: bool) -> _Records:
-        return _Records(self.residuals, self.options, self.structure, rows)
+    rows: bool
 
     def __call__(self, shared: list, own: list) -> dict[str, Array]:
         x, own_x, w, *records = own
@@ -97,9 +96,13 @@ class _Records:
             return dict(zip(("r", "J", "J_own"), read, strict=True))
         seen = problem.seen(both, *read)
         cost = jnp.sum(objective.losses(read[0].ravel())[0].reshape(w.shape), axis=1) / 2
-        R = jnp.linalg.qr(jnp.concatenate([seen.J, seen.r[:, :, None]], axis=2), mode="r")
         bend = () if seen.bend is None else jnp.broadcast_to(seen.bend, (len(w), x.size))
-        return {"R": R, "cost": cost, "bend": bend}
+        return {"R": triangles(seen), "cost": cost, "bend": bend}
+
+
+def triangles(seen: Seen) -> Array:
+    """R of [J r] = Q R of each record."""
+    return jnp.linalg.qr(jnp.concatenate([seen.J, seen.r[:, :, None]], axis=2), mode="r")
 
 
 class ManyRecords(NamedTuple):

@@ -2,7 +2,8 @@
 
     simulate          one run: a `Solution`, whose `check()` names the first step that failed
     sweep             many runs at once, with step sizes, parameters, starts and coefficients of their own
-    sweep_to_disk     the same in pieces, which survive being killed
+    sweep_to_disk     the same in pieces, which survive being killed, by this process or by workers
+    parallel_map      any function of many members, by the workers of an executor; `map_to_disk` keeps what is done
     adaptive          a tolerance in the place of the step size; `choose_steps` gives the steps alone
     Event, impact     what happens where a guard falls to zero: impacts, stops, switches, the end
     interpolate       what lies between the saved times
@@ -109,7 +110,16 @@ alone.
 
 `times=`, in the place of `duration` and `num_samples`, are sample times at any distances, as of measured data; steps
 end at each. `in_axes=`, as for `jax.vmap`, says what else differs between members. `sweep_to_disk` writes chunks of
-members as `.npz`, continues where it was killed, and refuses other inputs. On a cluster, in every process:
+members as `.npz`, or as one Zarr store, continues where it was killed, and refuses other inputs. With `executor=` the
+workers of a cluster run the chunks, whatever they are started by, as `parallel_map` has them run functions of yours.
+
+>>> from concurrent.futures import ThreadPoolExecutor                 # or Dask's client.get_executor(), MPIPoolExecutor
+>>> with ThreadPoolExecutor(2) as executor:
+...     ends = hhtjax.parallel_map(lambda dt: final_angle(dt, 0.0, 0.5), dts, chunk=3, executor=executor)
+>>> ends.shape
+(9,)
+
+Where all devices are there from the start, in every process:
 
     jax.distributed.initialize()
     mesh = jax.make_mesh((jax.device_count(),), ("members",))

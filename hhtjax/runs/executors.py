@@ -145,9 +145,14 @@ class Hands:
 
     def _submitted(self, members: str, task: Callable, *arguments: Any) -> Future:
         try:
-            return self.executor.submit(task, *arguments)
+            future = self.executor.submit(task, *arguments)
         except BrokenExecutor as error:
             raise self._died(members) from error
+        if not callable(getattr(future, "add_done_callback", None)):
+            raise TypeError(
+                f"{self.caller}: `executor.submit` must return a concurrent.futures.Future; received {future!r}."
+            )
+        return future
 
     def _require_another(self, members: str, error: Exception, tries: int):
         """An error unless a task that failed may be tried again."""
