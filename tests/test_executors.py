@@ -5,6 +5,7 @@ import importlib.util
 import multiprocessing
 import os
 import pickle
+import re
 import resource
 import shutil
 import signal
@@ -13,6 +14,7 @@ import sys
 import zlib
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 
 import friction_problems
 import jax
@@ -121,10 +123,14 @@ def test_dask_gives_the_same_bits(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(
-    importlib.util.find_spec("mpi4py") is None or shutil.which("mpiexec") is None, reason="MPI is not installed"
-)
 def test_mpi_gives_the_same_bits(tmp_path):
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    mpiexec = shutil.which("mpiexec", path=path)
+    tried = mpiexec and subprocess.run(
+        [mpiexec, "-n", "1", sys.executable, "-c", "from mpi4py import MPI"], check=False
+    )
+    if not tried or tried.returncode:
+        pytest.skip("MPI, or mpi4py, is not installed")
     script = tmp_path / "script.py"
     script.write_text(
         "import jax; jax.config.update('jax_enable_x64', True)\n"
@@ -133,10 +139,25 @@ def test_mpi_gives_the_same_bits(tmp_path):
         "    with MPIPoolExecutor() as executor:\n"
         "        found = hhtjax.parallel_map(t.end, t.K, 0.1, executor=executor, chunk=3, in_axes=(0, None))\n"
         "    assert t.same(found, hhtjax.parallel_map(t.end, t.K, 0.1, chunk=3, in_axes=(0, None)))\n"
+        "    print('the same')\n"
     )
     path = os.pathsep.join([os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")])
-    command = ["mpiexec", "-n", "2", sys.executable, "-m", "mpi4py.futures", str(script)]
-    subprocess.run(command, check=True, env=os.environ | {"PYTHONPATH": path}, timeout=300)
+    command = [mpiexec, "-n", "2", sys.executable, "-m", "mpi4py.futures", script]
+    environment = os.environ | {"PYTHONPATH": path}
+    done = subprocess.run(command, check=True, env=environment, stdout=subprocess.PIPE, text=True, timeout=300)
+    assert done.stdout.endswith("the same\n")
+
+
+@pytest.mark.slow
+def test_the_how_to_runs_as_a_script(tmp_path):
+    text = (Path(__file__).parents[1] / "docs" / "howto" / "many_machines.md").read_text()
+    script = text.split("```python\n")[1].split("```")[0].replace("10_000", "6").replace("chunk=1000", "chunk=3")
+    (tmp_path / "script.py").write_text(script)
+    done = subprocess.run(
+        [sys.executable, tmp_path / "script.py"], check=True, capture_output=True, text=True, timeout=300
+    )
+    assert re.fullmatch(r"\[ *\d+\.\d+ +\d+\.\d+ +\d+\.\d+\]", done.stdout.strip()), done.stdout
+    assert "chunk 2 of 2" in done.stderr
 
 
 def slope(k):
@@ -425,7 +446,7 @@ def test_a_zarr_store_is_continued(threads, tmp_path):
     where = hhtjax.map_to_disk(tmp_path / "store", jnp.sin, x, chunk=4, format="zarr")
     group = zarr.open_group(where, mode="r+")
     group["result"][4:8], group["chunk_written"][1] = 0, False
-    with pytest.raises(FileNotFoundError, match="1 of 3 chunks are missing in .*, the first is number 1"):
+    with pytest.raises(FileNotFoundError, match=r"1 of 3 chunks are missing in .*, the first is number 1"):
         hhtjax.load_sweep(where)
     hhtjax.map_to_disk(where, jnp.sin, x, chunk=4, format="zarr", executor=threads)
     np.testing.assert_allclose(hhtjax.load_sweep(where)["result"], np.sin(x), rtol=1e-14)

@@ -7,8 +7,10 @@
 
 # %%
 import json
+import multiprocessing
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import jax
@@ -189,13 +191,10 @@ print("equal to the sweep in memory, to", float(np.abs(loaded["q"] - runs.q).max
 # ## By other processes
 #
 # `executor=` hands the chunks to the workers of any executor of Python's standard library's kind. Here they are two
-# processes of this machine; on a cluster they are Dask's or MPI's. Workers are sent the compiled program, not the functions of
-# this notebook, so nothing has to be importable there. The files are the same, bit by bit.
+# processes of this machine; on a cluster they are Dask's or MPI's. Workers are sent the compiled program, not the
+# functions of this notebook, so nothing has to be importable there. The files are the same, bit by bit.
 
 # %%
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
-
 with tempfile.TemporaryDirectory() as temporary:
     alone = hhtjax.load_sweep(to_disk(Path(temporary) / "alone"))
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as executor:
