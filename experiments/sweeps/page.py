@@ -29,15 +29,60 @@ def bars_table(numbers):
         [
             "two processes, bitwise equal to one",
             "equal",
-            *(["equal", "yes"] if devices["bitwise_equal"] else ["", "**no**"]),
+            *is_equal(devices["bitwise_equal"]),
         ],
         ["two processes, time over one's", "<= 0.65", *verdict(devices["over_one"]["two processes"], 0.65)],
+        *worker_bars(numbers["workers"]),
         ["beam, exponent of time, forward", "<= 1.1", *verdict(beam["forward_us_per_step"], 1.1)],
         ["beam, exponent of time, gradient", "<= 1.1", *verdict(beam["gradient_us_per_step"], 1.1)],
         [f"1 kHz, deadlines missed in {real['calls']} calls", "0", *verdict(paced["deadlines_missed"], 0)],
         ["1 kHz step, median over an empty call", "<= 3", *verdict(real["median_over_empty_call"], 3)],
     ]
     return table(["what", "bar", "measured", "holds"], rows)
+
+
+def worker_bars(numbers):
+    """Of workers that are handed chunks."""
+    rows, memory = numbers["rows"], numbers["memory_MB"]
+    small, large = (memory[key] for key in sorted(memory, key=int))
+    two = [name for name in rows if name.endswith(", 2")]
+    compiled = max(max(rows[name]["compiled_by_each"]) for name in two)
+    whole = all(x["equal"] for x in numbers["killed"].values())
+    return [
+        *([f"{name} workers, time over one's", "<= 0.55", *verdict(over_one(rows, name), 0.55)] for name in two),
+        ["programs that a worker compiles", "1", *verdict(compiled, 1)],
+        ["workers, bitwise equal to one process", "equal", *is_equal(numbers["bitwise_equal"])],
+        ["20 workers and 20 callers killed, files equal", "equal", *is_equal(whole)],
+        ["1e6 members, the caller's memory over that of 1e5", "<= 1.5", *verdict(large / small, 1.5)],
+    ]
+
+
+def is_equal(value):
+    """A row's last cells."""
+    return ["equal", "yes"] if value else ["", "**no**"]
+
+
+def over_one(rows, name):
+    """The time of two workers over that of one."""
+    return rows[name]["seconds"] / rows[name.replace("2", "1")]["seconds"]
+
+
+def workers_table(numbers):
+    """Who worked, and what it took."""
+    rows, alone = numbers["rows"], numbers["rows"]["none"]["seconds"]
+    cells = []
+    for name, x in rows.items():
+        more = [f"{x[key] * unit:.3g}" if key in x else "" for key, unit in (("first_s", 1), ("task_s", 1e3))]
+        who = "none: this process" if name == "none" else name
+        cells.append([who, f"{x['seconds']:.1f}", f"{x['seconds'] / alone:.2f}", *more])
+    return table(["workers", "s", "over no workers", "first sweep, compiled (s)", "a task without work (ms)"], cells)
+
+
+def queue_table(numbers):
+    """Shares of time in which workers work."""
+    header = ["workers", *(f"{x:g} s" for x in numbers["seconds"]), "done again"]
+    cells = [[n, *(f"{x:.2f}" for x in shares), numbers["done_again"][n]] for n, shares in numbers["share"].items()]
+    return table(header, cells)
 
 
 def orders_table(rows):
@@ -115,6 +160,21 @@ def page(numbers):
                 ["", "s", "over one device"],
                 [[name, f"{x:.2f}", f"{devices['over_one'][name]:.2f}"] for name, x in devices["seconds"].items()],
             ),
+            worker_members=numbers["workers"]["members"],
+            worker_chunk=numbers["workers"]["chunk"],
+            worker_steps=numbers["workers"]["steps"],
+            workers=workers_table(numbers["workers"]),
+            blob=numbers["workers"]["bytes"] / 1e3,
+            blob_rate=100 * numbers["workers"]["bytes"] / 1e6,
+            kills="; ".join(f"{x['kills']} {name}" for name, x in numbers["workers"]["killed"].items()),
+            memory=", ".join(
+                f"{x:.0f} MB ({float(n):.0e} members)" for n, x in numbers["workers"]["memory_MB"].items()
+            ),
+            compiling_hours=1000 * numbers["queue"]["compiling_s"] / 3600,
+            queue=queue_table(numbers["queue"]),
+            task_ms=numbers["queue"]["task_s"] * 1e3,
+            compiling=numbers["queue"]["compiling_s"],
+            rounds=numbers["queue"]["rounds"],
             cores=numbers["machine"].split()[0],
             bytes_per_member=bytes_per_member,
             core_hours=core_seconds / 3600,

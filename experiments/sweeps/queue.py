@@ -5,11 +5,11 @@ fifth; a worker dies after an exponentially distributed time, is replaced after 
 """
 
 import heapq
-import json
-from pathlib import Path
+import sys
 
 import numpy as np
 
+from experiments.parts import earlier
 from experiments.report import COLOURS, MARKERS
 from hhtjax.plot import legend, subplots
 
@@ -52,7 +52,7 @@ def simulated(workers, seconds, task_s, rng, life=LIFE):
 
 def run(report, fast):
     """Shares of the time in which workers work, and a chart."""
-    measured = {} if fast else json.loads((Path(__file__).parent / "sweeps.json").read_text()).get(SOURCE, {})
+    measured = {} if fast else earlier(report, sys.modules[__name__]).get(SOURCE, {})
     rows = measured.get("rows", {})
     task_s = next((x["task_s"] for name, x in rows.items() if name == "Dask, 2"), 1e-3)
     workers, seconds = ((10,), (1.0, 10.0)) if fast else (WORKERS, SECONDS)

@@ -1,10 +1,10 @@
-"""Step sizes as data: one call for all, orders, maps of many members, devices, large systems, real time."""
+"""Step sizes as data: one call for all, orders, maps of many members, devices, workers, large systems, real time."""
 
 from experiments.parts import run_experiment
 from experiments.report import Report
-from experiments.sweeps import devices, large, map, one_call, orders, real_time
+from experiments.sweeps import devices, large, map, one_call, orders, queue, real_time, workers
 
-PARTS = map, real_time, one_call, devices, orders, large
+PARTS = map, real_time, one_call, devices, workers, queue, orders, large
 
 
 def run(report: Report, fast: bool):

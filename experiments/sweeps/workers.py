@@ -19,6 +19,7 @@ import threading
 import time
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -29,8 +30,9 @@ MANY, SMALL = 1_000_000, 20_000  # members, few steps each: what the caller's me
 TASKS = 1000  # without work
 
 
+@cache
 def oscillator():
-    """System, q0, v0, params of many."""
+    """System, q0, v0."""
     import jax.numpy as jnp
     import numpy as np
 
@@ -55,10 +57,10 @@ def swept(folder, members, chunk, steps, executor=None, samples=4):
 
     import hhtjax
 
+    system, q0, v0 = oscillator()
     return hhtjax.sweep_to_disk(
-        folder, *oscillator()[:1], hhtjax.hht(), *oscillator()[1:], {"k": stiffnesses(members)},
-        in_axes=(None, None, None, {"k": 0}), dts=np.full(members, 0.01), duration=0.01 * steps, num_samples=samples,
-        chunk=chunk, executor=executor,
+        folder, system, hhtjax.hht(), q0, v0, {"k": stiffnesses(members)}, in_axes=(None, None, None, {"k": 0}),
+        dts=np.full(members, 0.01), duration=0.01 * steps, num_samples=samples, chunk=chunk, executor=executor,
     )  # fmt: skip
 
 
