@@ -237,7 +237,9 @@ class Failing(Executor):
 def test_what_fails_is_tried_again_and_then_named():
     known, no_room = hhtjax.parallel_map(jnp.sin, K, chunk=3), MemoryError("no room")
     assert same(hhtjax.parallel_map(jnp.sin, K, chunk=3, executor=Failing(2, no_room)), known)
-    with pytest.raises(RuntimeError, match=r"member.* failed 3 times, at last by MemoryError: no room") as raised:
+    with pytest.raises(
+        RuntimeError, match=r"member.* failed 3 times, .* MemoryError: no room; a smaller `chunk`"
+    ) as raised:
         hhtjax.parallel_map(jnp.sin, K, chunk=3, executor=Failing(9, no_room))
     assert raised.value.__cause__ is no_room
     with pytest.raises(RuntimeError, match="members 0 to 2 failed 1 times"):
@@ -335,6 +337,18 @@ def test_a_map_on_disk_is_continued_and_read_piece_by_piece(threads, tmp_path):
     np.testing.assert_array_equal(list(c), found["c"])
     alone = hhtjax.map_to_disk(tmp_path / "alone", jnp.sin, x, chunk=4)
     np.testing.assert_allclose(hhtjax.load_sweep(alone)["result"], np.sin(x), rtol=1e-14)
+
+
+def test_two_callers_may_write_to_one_folder(threads, tmp_path):
+    folder, x = tmp_path / "map", np.arange(40.0)
+    with ThreadPoolExecutor(2) as callers:
+        calls = [
+            callers.submit(hhtjax.map_to_disk, folder, jnp.sin, x, chunk=1, executor=executor)
+            for executor in (threads, None)
+        ]
+        assert [call.result() for call in calls] == [folder, folder]
+    np.testing.assert_allclose(hhtjax.load_sweep(folder)["result"], np.sin(x), rtol=1e-14)
+    assert len(list(folder.iterdir())) == 41
 
 
 def test_another_chunk_in_a_chunks_place_is_noticed(tmp_path):

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import hhtjax
+from hhtjax.runs import storage
 
 DTS = np.logspace(-4, -2, 22)
 ONE, ZERO = np.ones(1), np.zeros(1)
@@ -63,14 +64,14 @@ def test_what_is_read_is_what_sweep_returns(whole):
 
 def main(folder):
     """What the process that is killed runs: slowly, and it says what it has done."""
-    written = hhtjax.runs.sweep_to_disk._write
+    written = storage.write_whole
 
-    def slowly(path, fill):
+    def slowly(caller, path, fill):
         time.sleep(0.05)
-        written(path, fill)
+        written(caller, path, fill)
         print(path.name, flush=True)
 
-    hhtjax.runs.sweep_to_disk._write = slowly
+    storage.write_whole = slowly
     write(folder)
 
 

@@ -162,6 +162,8 @@ class Hands:
             raise RuntimeError(f"{self.caller}: {error}") from error
         if tries > self.retries:
             words = f"{self.caller}: {members} failed {tries} times, at last by {type(error).__name__}: {error}"
+            if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+                words += "; a smaller `chunk` takes less"
             if isinstance(error, OSError):
                 raise OSError(error.errno, words) from error
             raise RuntimeError(words) from error
