@@ -291,7 +291,7 @@ def _by_workers(fits: _Starts, data: Data, starts: PyTree, executor: Executor, c
         )
     hands = require_executor("multistart", executor)
     shared, own = ([np.asarray(x) for x in jax.tree.leaves(tree)] for tree in (data, starts))
-    chunks = Chunks(len(own[0]), require_integer("multistart", "chunk", chunk))
+    chunks = Chunks.of(len(own[0]), require_integer("multistart", "chunk", chunk))
     work = Work(fits, shared, lambda members: [x[members] for x in own], chunks, {})
     return jax.device_put(collected(work, hands))
 

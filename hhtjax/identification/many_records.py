@@ -53,12 +53,14 @@ class Many(NamedTuple):
 
     def _evaluated(self, f: _Records, shared: list, of_records: list, count: int, p: int) -> Callable:
         """x -> results for all records."""
-        length = self.chunk if self.mesh is None else -(-count // self.mesh.size) * self.mesh.size
 
         def own_at(x: np.ndarray, members: np.ndarray) -> list:
             return [x[:p], x[p:].reshape(count, -1)[members], *(y[members] for y in of_records)]
 
-        chunks = Chunks(count, length)
+        if self.mesh is None:
+            chunks = Chunks.of(count, self.chunk)
+        else:  # one, a whole number of records for each device
+            chunks = Chunks(count, -(-count // self.mesh.size) * self.mesh.size)
         packed: list = []  # the program, which is the same for all x
 
         def at(x: np.ndarray) -> PyTree:

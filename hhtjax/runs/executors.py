@@ -44,6 +44,11 @@ class Chunks(NamedTuple):
     size: int
     length: int
 
+    @classmethod
+    def of(cls, size: int, most: int) -> Chunks:
+        """No more chunks than have to be, with `most` members at most, and about equally many in each."""
+        return cls(size, -(-size // -(-size // most)))
+
     @property
     def number(self) -> int:
         """Of chunks."""

@@ -39,7 +39,7 @@ def parallel_map(
         executor: any `concurrent.futures.Executor`: `ProcessPoolExecutor` with
             mp_context=multiprocessing.get_context("spawn"), Dask's `client.get_executor()`, `MPIPoolExecutor` of
             mpi4py. None: this process does it.
-        chunk: members in a task. Seconds of work in each: to hand one out takes about a millisecond.
+        chunk: members in a task, at most. Seconds of work in each: to hand one out takes about a millisecond.
         in_axes: for each argument, or for branches of it, 0, or None where members share it.
         in_flight: tasks handed out and not yet returned, at most; take twice as many as there are workers.
         retries: how often a task that failed is tried again.
@@ -98,7 +98,7 @@ def work_of(caller: str, f: Callable, arguments: tuple, in_axes: Any, chunk: int
     def own(members: np.ndarray) -> list:
         return [x[members] for x in of_members]
 
-    return Work(_Mapped(current(f), structure, mapped, kinds), shared, own, Chunks(sizes.pop(), chunk), {})
+    return Work(_Mapped(current(f), structure, mapped, kinds), shared, own, Chunks.of(sizes.pop(), chunk), {})
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ def sweep_to_disk(
 
     Args:
         folder: made if it does not exist.
-        chunk: members in a file, which bounds the memory.
+        chunk: members in a file at most, which bounds the memory.
         progress: one line on stderr, rewritten with each file.
         executor: any `concurrent.futures.Executor`, as for `parallel_map`. None: this process.
         in_flight, retries: as for `parallel_map`.
@@ -235,7 +235,7 @@ def _hash(work: Work) -> str:
 
 def _work(inputs: Inputs, chunk: int) -> Work:
     """The `Work` of a sweep."""
-    chunks = Chunks(inputs.size, chunk)
+    chunks = Chunks.of(inputs.size, chunk)
     by_errors = isinstance(inputs.dts, Adaptive)
     if by_errors:
         static, fitting = {}, {"rates": inputs.sizes()[1]}
@@ -250,7 +250,7 @@ def _work(inputs: Inputs, chunk: int) -> Work:
     arrays = [np.asarray(x) for x in leaves]
     shared = [x for x, flag in zip(arrays, mapped, strict=True) if not flag]
     of_members = [x for x, flag in zip(arrays, mapped, strict=True) if flag]
-    rest = inputs._replace(size=chunk, **dict.fromkeys(ARRAYS))
+    rest = inputs._replace(size=chunks.length, **dict.fromkeys(ARRAYS))
     f = _Swept(structure, tuple(mapped), tuple(rest), tuple(sorted(static.items())), by_errors)
     return Work(f, shared, lambda members: [x[members] for x in of_members], chunks, fitting)
 
