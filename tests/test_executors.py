@@ -188,6 +188,51 @@ def test_keys_trees_and_dtypes_cross(threads):
         assert (found.dtype, small.dtype, small.shape) == (np.float32, np.int8, (5,))
 
 
+def test_numbers_stay_weak_and_none_is_no_argument(threads):
+    x = np.arange(3, dtype=np.float32)
+    for executor in (None, threads):
+        found = hhtjax.parallel_map(
+            lambda x, scale, none: scale["a"] * x if none is None else x, x, {"a": 2.0, "b": None}, None,
+            in_axes=(0, None, None), chunk=2, executor=executor,
+        )  # fmt: skip
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, 2 * x)
+
+
+@pytest.mark.filterwarnings("ignore:sweep. in float32")
+def test_sweeps_of_float32_cross(threads, tmp_path):
+    start = SPRING, hhtjax.hht(), np.ones(1, np.float32), np.zeros(1, np.float32), {"k": 4.0}
+    sweep = {"dts": np.full(3, 0.1), "duration": 1.0, "num_samples": 1, "chunk": 2}
+    one = hhtjax.sweep_to_disk(tmp_path / "one", *start, **sweep)
+    other = hhtjax.sweep_to_disk(tmp_path / "other", *start, **sweep, executor=threads)
+    assert contents(one) == contents(other)
+    assert hhtjax.load_sweep(one)["q"].dtype == np.float32
+
+
+def test_what_files_cannot_hold_is_refused(tmp_path):
+    for f, error, words in (
+        (lambda x: {"a": {"b": x}, "a.b": x}, ValueError, "must have names of their own"),
+        (lambda x: {"file": x}, ValueError, "received 'file'"),
+        (lambda x: {"a/b": x}, ValueError, "received 'a/b'"),
+        (lambda x: x.astype(jnp.bfloat16), TypeError, "must be of a dtype of NumPy; received bfloat16"),
+    ):
+        with pytest.raises(error, match=words):
+            hhtjax.map_to_disk(tmp_path / "map", f, K, chunk=3)
+
+
+def test_an_executor_that_is_gone_is_named():
+    with ThreadPoolExecutor(1) as executor:
+        pass
+    with pytest.raises(RuntimeError, match="parallel_map: `executor` takes no tasks: cannot schedule new futures"):
+        hhtjax.parallel_map(jnp.sin, K, chunk=3, executor=executor)
+
+
+def test_workers_that_write_elsewhere_are_noticed(threads, tmp_path, monkeypatch):
+    monkeypatch.setattr(storage.Npz, "write", lambda *_: None)
+    with pytest.raises(RuntimeError, match="map_to_disk: workers wrote 3 chunks that are not in"):
+        hhtjax.map_to_disk(tmp_path / "map", jnp.sin, K, chunk=3, executor=threads)
+
+
 def test_what_cannot_be_mapped_is_refused():
     def refused(words, *arguments, error=ValueError, **options):
         with pytest.raises(error, match=words):
@@ -202,6 +247,8 @@ def test_what_cannot_be_mapped_is_refused():
     refused("`chunk` must be a positive integer; received 0", jnp.sin, K, chunk=0)
     refused("`executor` must be a concurrent.futures.Executor", jnp.sin, K, executor=4, error=TypeError)
     refused("must return arrays of numbers; received keys", jax.random.key, np.arange(3), error=TypeError)
+    refused("must be pytrees of arrays and numbers", jnp.sin, np.array([None, 1]), error=TypeError)
+    refused("`f` must be hashable; received Unhashable", Unhashable(), K, error=TypeError)
     with pytest.raises(TypeError, match="must be known: call it outside jit"):
         jax.jit(lambda x: hhtjax.parallel_map(jnp.sin, x, chunk=2))(K)
 
@@ -213,6 +260,15 @@ def test_callbacks_cannot_cross(threads):
     with pytest.raises(NotImplementedError, match="parallel_map: with an `executor`, no function may call back"):
         hhtjax.parallel_map(asked, K, chunk=3, executor=threads)
     np.testing.assert_allclose(hhtjax.parallel_map(asked, K, chunk=3), np.sin(K))
+
+
+class Unhashable:
+    """A function with data."""
+
+    __hash__ = None
+
+    def __call__(self, x):
+        return x
 
 
 class Failing(Executor):
@@ -303,8 +359,10 @@ def test_a_worker_that_does_not_fit_says_why(threads, monkeypatch):
     ):
 
         def other(*arguments, changed=changed):
-            content = workers._Content(*pickle.loads(zlib.decompress(real(*arguments).content)))
-            return workers.Packed("another", zlib.compress(pickle.dumps(tuple(content._replace(**changed)))))
+            program = real(*arguments)
+            content = workers._Content(*pickle.loads(zlib.decompress(program.content)))
+            content = zlib.compress(pickle.dumps(tuple(content._replace(**changed))))
+            return program._replace(key="another", content=content)
 
         with monkeypatch.context() as patch:
             patch.setattr(executors, "packed", other)
@@ -330,7 +388,8 @@ def test_a_map_on_disk_is_continued_and_read_piece_by_piece(threads, tmp_path):
     c = lazy["c"]
     assert (c.shape, c.ndim, len(c), c.dtype) == ((10, 2), 2, 10, np.float64)
     assert "'c' on disk" in repr(c)
-    indices = 3, -1, slice(2, 9, 3), slice(3, 7), np.array([9, 0, 4]), (slice(None), 1), (5, 1), (slice(2, 5), 0), ...
+    indices = 3, -1, slice(2, 9, 3), slice(3, 7), np.array([9, 0, 4]), (slice(None), 1), (5, 1), (slice(2, 5), 0)
+    indices += ..., (), ([0, 1], [0, 1]), np.array([[0, 1], [2, 3]]), (..., 0), np.arange(10) > 4
     for index in indices:
         np.testing.assert_array_equal(c[index], found["c"][index])
     np.testing.assert_array_equal(np.asarray(c), found["c"])

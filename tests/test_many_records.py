@@ -80,6 +80,19 @@ def test_the_triangles_are_those_of_the_rows(threads):
     )
 
 
+@pytest.mark.slow
+def test_a_task_may_hold_fewer_residuals_than_there_are_parameters(threads):
+    records = RNG.normal(size=(12, 3))
+
+    def line(params, start, record):
+        return params["a"] * jnp.arange(3.0) + params["b"] * jnp.array([0.0, 0.0, 1.0]) + start - record
+
+    guess = {"a": 0.0, "b": 0.0, "c": 1.0}
+    options = {"records": records, "starts": records[:, 0].copy(), "transforms": {"c": hhtjax.fixed}}
+    found = hhtjax.fit(line, guess, **options, executor=threads)
+    np.testing.assert_allclose(found.params["a"], hhtjax.fit(line, guess, **options).params["a"], rtol=1e-8)
+
+
 def test_what_cannot_be_shared_out_is_refused(threads):
     def refused(words, error=ValueError, **options):
         with pytest.raises(error, match=words):

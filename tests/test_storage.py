@@ -118,7 +118,7 @@ def test_a_damaged_chunk_is_written_again(whole):
     path = whole / "chunk-00003.npz"
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(
-        ValueError, match=r"load_sweep: .*chunk-00003\.npz is damaged .*: repeat the call of sweep_to_d"
+        ValueError, match=r"load_sweep: .*chunk-00003\.npz is damaged .*: repeat the call that wrote it"
     ):
         hhtjax.load_sweep(whole)
     write(whole)

@@ -2,9 +2,9 @@
 
 from experiments.parts import run_experiment
 from experiments.report import Report
-from experiments.sweeps import devices, large, map, one_call, orders, queue, real_time, workers
+from experiments.sweeps import devices, large, map, on_paper, one_call, orders, real_time, workers
 
-PARTS = map, real_time, one_call, devices, workers, queue, orders, large
+PARTS = map, real_time, one_call, devices, workers, on_paper, orders, large
 
 
 def run(report: Report, fast: bool):

@@ -18,7 +18,7 @@ import tempfile
 import threading
 import time
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
@@ -113,7 +113,7 @@ def dask(number):
         Client(cluster) as client,
     ):
         client.run(count_compilations)
-        yield client.get_executor(pure=False)
+        yield client.get_executor()
 
 
 POOLS = {"processes": processes, "Dask": dask}
@@ -163,9 +163,8 @@ def killed(kind, number, members, chunk, steps, kills):
             def kill():
                 nonlocal count
                 while not ended.wait(random.uniform(0.3, 1.5)) and count < kills:
-                    pids = list(pool._client.run(os.getpid).values())
-                    if pids:
-                        os.kill(random.choice(pids), signal.SIGKILL)
+                    with suppress(Exception):  # while a worker starts anew it does not answer
+                        os.kill(random.choice(list(pool._client.run(os.getpid).values())), signal.SIGKILL)
                         count += 1
 
             killer = threading.Thread(target=kill, daemon=True)
@@ -221,7 +220,66 @@ def memory(members, chunk):
     return found
 
 
-CASES = {"timed": timed, "killed": killed, "caller_killed": caller_killed, "called": called, "memory": memory}
+def records(count, samples, steps, chunk):
+    """Seconds of a fit of so many records alone and by two processes, both compiled, how far apart the estimates are in
+    standard errors, and the bytes that come back in an evaluation, of triangles and of rows."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    import hhtjax
+
+    pendulum = hhtjax.System(np.ones(1), lambda q, v, t, params: -params["k"] * jnp.sin(q) - params["c"] * v)
+
+    def motion(params, start):
+        run = hhtjax.simulate(
+            pendulum, hhtjax.hht(), start[None], jnp.zeros(1), params, dt=0.01, num_steps=steps,
+            save_every=steps // samples,
+        )  # fmt: skip
+        return run.q[1:, 0]
+
+    def residuals(params, start, record):
+        return motion(params, start) - record
+
+    rng = np.random.default_rng(0)
+    starts = rng.uniform(0.3, 1.2, count)
+    measured = np.asarray(jax.vmap(lambda start: motion({"k": 4.0, "c": 0.3}, start))(starts))
+    measured = measured + 0.01 * rng.normal(size=measured.shape)
+
+    def fitted(**way):
+        start = time.perf_counter()
+        guess = {"k": 3.0, "c": 0.1}
+        found = hhtjax.fit(residuals, guess, records=measured, starts=0 * starts + 0.7, weights=100.0, **way)
+        return time.perf_counter() - start, found
+
+    fitted()
+    alone, known = fitted()
+    with processes(2) as pool:
+        fitted(executor=pool, chunk=chunk)
+        shared, found = fitted(executor=pool, chunk=chunk)
+    apart = {k: abs(float(x - known.params[k])) / float(known.standard_errors[k]) for k, x in found.params.items()}
+    unknowns = len(apart) + 1
+    return {
+        "records": count,
+        "samples": samples,
+        "alone_s": alone,
+        "two_workers_s": shared,
+        "iterations": int(known.iterations),
+        "iterations_shared": int(found.iterations),
+        "apart_in_standard_errors": max(apart.values()),
+        "bytes_of_triangles": 8 * count * (unknowns + 1) ** 2,
+        "bytes_of_rows": 8 * count * samples * (unknowns + 1),
+    }
+
+
+CASES = {
+    "records": records,
+    "timed": timed,
+    "killed": killed,
+    "caller_killed": caller_killed,
+    "called": called,
+    "memory": memory,
+}
 
 
 def case(name, *arguments):
@@ -259,6 +317,8 @@ def run(report, fast):
     equal = len({x["hash"] for x in found.values()}) == 1
     numbers = {"members": members, "chunk": chunk, "steps": steps, "bitwise_equal": equal, "bytes": blob_bytes()}
     numbers["rows"] = {name: {k: v for k, v in x.items() if k != "hash"} for name, x in found.items()}
+    numbers["fit"] = case("records", *((8, 10, 20, 4) if fast else (1000, 500, 2000, 125)))
+    report.progress(f"workers: a fit of records: {numbers['fit']}")
     print(f"workers: bitwise equal: {equal}\n")
     report.table(["", "s"], [[name, x["seconds"]] for name, x in found.items()])
     if fast:

@@ -40,7 +40,7 @@ from hhtjax.identification.problem import is_on_host, solve, solve_on_host
 from hhtjax.identification.residuals import check_weights, first_bad
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS
-from hhtjax.runs.executors import Chunks, Work, collected, require_executor
+from hhtjax.runs.executors import Chunks, Work, collected, require_executor, sent
 
 if TYPE_CHECKING:
     from hhtjax.identification.arguments import Options
@@ -107,7 +107,7 @@ def fit(
             is as large as its numbers of unknowns; residuals and Jacobians do so once, at the minimum, for standard
             errors. By Levenberg-Marquardt, outside jit; its steps are not bent (geodesic acceleration), which takes the
             rows, so there may be more of them. The minimum is the same.
-        mesh: devices that do so, in the place of an executor, `jax.make_mesh((jax.device_count(),), ("records",))`.
+        mesh: devices of the CPU that do so, in the place of an executor: `jax.make_mesh((2,), ("records",))`.
         chunk: records in a task of an executor.
 
     A function is traced and compiled once, and anew where something that it reads from outside differs, as `simulate`
@@ -290,7 +290,7 @@ def _by_workers(fits: _Starts, data: Data, starts: PyTree, executor: Executor, c
             "multistart: with an `executor`, all arguments must be known: call it outside jit, vmap and grad."
         )
     hands = require_executor("multistart", executor)
-    shared, own = ([np.asarray(x) for x in jax.tree.leaves(tree)] for tree in (data, starts))
+    shared, own = [sent(x) for x in jax.tree.leaves(data)], [np.asarray(x) for x in jax.tree.leaves(starts)]
     chunks = Chunks.of(len(own[0]), require_integer("multistart", "chunk", chunk))
     work = Work(fits, shared, lambda members: [x[members] for x in own], chunks, {})
     return jax.device_put(collected(work, hands))

@@ -17,14 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from hhtjax.description import Array, PyTree
+from hhtjax.description import Array, PyTree, programs
 from hhtjax.identification.arguments import Options
 from hhtjax.identification.bordered_least_squares import Arrow, ArrowTrial, arrow_trial
 from hhtjax.identification.gauss_newton import Seen
 from hhtjax.identification.losses import Objective
 from hhtjax.identification.parameter_vector import Coordinates, Data, record_parts
 from hhtjax.identification.problem import HostRecords
-from hhtjax.runs.executors import Chunks, Hands, Work, collected
+from hhtjax.runs.executors import Chunks, Hands, Work, collected, sent
 
 if TYPE_CHECKING:
     from hhtjax.description.current import Reading
@@ -43,7 +43,7 @@ class Many(NamedTuple):
         """The least-squares problem."""
         shared, records = data._replace(weights=True, records=None, starts=None), (data.starts, data.records)
         structure = jax.tree.structure((params0, shared, records))
-        given = [np.asarray(x) for x in jax.tree.leaves((params0, shared))]
+        given = [sent(x) for x in jax.tree.leaves((params0, shared))]
         of_records = [w, *(np.asarray(x) for x in jax.tree.leaves(records))]
         by = [
             self._evaluated(_Records(residuals, options, structure, rows), given, of_records, len(w), p)
@@ -89,7 +89,7 @@ class _Records:
         params0, data, (starts, records) = jax.tree.unflatten(self.structure, [*shared, *records])
         data = data._replace(starts=starts, records=records)
         coordinates = Coordinates(self.options.transforms, params0, data.scale)
-        parts = record_parts(self.residuals, coordinates, data)
+        parts = record_parts(self.residuals, coordinates, data, at_least=0)  # there may be few records here
         objective = Objective(w.ravel(), self.options.loss, w.size)
         problem = Arrow(parts.f, objective, records, x.size, coordinates.bend())
         both = jnp.concatenate([x, own_x.ravel()])
@@ -155,3 +155,6 @@ def _on_mesh(f: _Records, mesh: Mesh, shared: list, own: list) -> PyTree:
         check_vma=False,
     )
     return parts(shared, x, of_records)
+
+
+programs.add(_on_mesh)

@@ -134,8 +134,11 @@ class RecordParts(NamedTuple):
     shapes: tuple  # of the leaves of the residuals, all records together
 
 
-def record_parts(residuals: Callable, coordinates: Coordinates, data: PyTree) -> RecordParts:
-    """One residual function of each record, with a start of its own."""
+def record_parts(
+    residuals: Callable, coordinates: Coordinates, data: PyTree, at_least: int | None = None
+) -> RecordParts:
+    """One residual function of each record, with a start of its own. at_least: how many residuals there have to be, by
+    default as many as unknowns."""
     _, unravel_start = ravel_pytree(first(data.starts))
     own0 = jax.vmap(lambda start: ravel_pytree(start)[0])(data.starts)
 
@@ -143,7 +146,8 @@ def record_parts(residuals: Callable, coordinates: Coordinates, data: PyTree) ->
         return jax.vmap(partial(residuals, params))(starts, records)
 
     unknowns, params0 = coordinates.x0.size + own0.size, coordinates.params(coordinates.x0)
-    shapes = check_residuals("fit", every, unknowns, params0, data.starts, data.records)
+    at_least = unknowns if at_least is None else at_least
+    shapes = check_residuals("fit", every, at_least, params0, data.starts, data.records)
     one = params0, first(data.starts), first(data.records)
     require_own_samples(
         "fit", residuals, jax.tree.map(lambda y: jax.ShapeDtypeStruct(y.shape[1:], y.dtype), shapes), *one

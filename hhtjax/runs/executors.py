@@ -7,6 +7,7 @@ interrupted.
 
 from __future__ import annotations
 
+import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import BrokenExecutor, Executor, Future
@@ -19,7 +20,7 @@ import jax
 import numpy as np
 
 from hhtjax.checks import require_integer
-from hhtjax.description import PyTree
+from hhtjax.description import PyTree, is_array
 from hhtjax.description.presentation import overwrite
 from hhtjax.runs.workers import Packed, Unfit, packed, results
 from hhtjax.xla import Programs
@@ -71,7 +72,8 @@ class Chunks(NamedTuple):
 class Work(NamedTuple):
     """A function f(shared, own) of lists of arrays, hashable, and what it is called with for each chunk.
 
-    own: numbers of members -> theirs; fitting: of the system in it, by which `Programs` choose."""
+    shared: arrays, and Python numbers, which are weak; own: numbers of members -> theirs; fitting: of the system in it,
+    by which `Programs` choose."""
 
     f: Callable
     shared: list
@@ -120,15 +122,16 @@ class Hands:
     progress: bool
 
     def work(self, task: Callable, chunks: Chunks, these: Iterable[int], arguments: Callable, take: Callable):
-        """task(*arguments(k)) for each of these chunks k, and take(k, result) as they come."""
+        """task(*arguments(k, ticket)) for each of these chunks k, and take(k, result) as they come. ticket: another one
+        for each try."""
         waiting, flying, tries = deque(these), {}, Counter()
         ended: SimpleQueue[Future] = SimpleQueue()
-        total, done = len(waiting), 0
+        call, total, done = uuid.uuid4().hex, len(waiting), 0
         try:
             while waiting or flying:
                 while waiting and len(flying) < self.in_flight:
                     k = waiting.popleft()
-                    future = self._submitted(chunks.named(k), task, *arguments(k))
+                    future = self._submitted(chunks.named(k), task, *arguments(k, (call, k, tries[k])))
                     flying[future] = k
                     future.add_done_callback(ended.put)
                 future = _next(ended)
@@ -153,6 +156,8 @@ class Hands:
             future = self.executor.submit(task, *arguments)
         except BrokenExecutor as error:
             raise self._died(members) from error
+        except RuntimeError as error:
+            raise RuntimeError(f"{self.caller}: `executor` takes no tasks: {error}.") from error
         if not callable(getattr(future, "add_done_callback", None)):
             raise TypeError(
                 f"{self.caller}: `executor.submit` must return a concurrent.futures.Future; received {future!r}."
@@ -169,14 +174,15 @@ class Hands:
             words = f"{self.caller}: {members} failed {tries} times, at last by {type(error).__name__}: {error}"
             if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
                 words += "; a smaller `chunk` takes less"
-            if isinstance(error, OSError):
+            if isinstance(error, OSError) and error.errno:
                 raise OSError(error.errno, words) from error
             raise RuntimeError(words) from error
 
     def _died(self, members: str) -> RuntimeError:
         return RuntimeError(
-            f"{self.caller}: a worker died at {members}, or beside them: killed, often because memory ran out (a "
-            "smaller `chunk` takes less). This executor is broken: make another one, and repeat the call."
+            f"{self.caller}: a worker died at {members}, or beside them. It was killed, often because memory ran out "
+            "(a smaller `chunk` takes less), or it could not start: the call must stand under `if __name__ == "
+            "'__main__':` in a script. This executor is broken: make another one, and repeat the call."
         )
 
 
@@ -218,13 +224,18 @@ def collected(work: Work, hands: Hands | None, progress: bool = False, program: 
 
     if hands is not None:
         program = program or work.packed(hands.caller)
-        hands.work(results, chunks, range(chunks.number), lambda k: (program, work.arrays(k)), take)
+        hands.work(results, chunks, range(chunks.number), lambda k, ticket: (program, work.arrays(k), ticket), take)
     else:
         for k in range(chunks.number):
             take(k, work.here(k))
             if progress:
                 show(k + 1, chunks.number)
     return jax.tree.unflatten(structure, found)
+
+
+def sent(x: Any) -> Any:
+    """A leaf as an array of NumPy; one of a weak type, such as a Python number, as it is."""
+    return x if not is_array(x) or getattr(x, "weak_type", False) else np.asarray(x)
 
 
 def show(done: int, total: int):

@@ -42,17 +42,16 @@ def load_sweep(folder: str | Path, *, lazy: bool = False) -> dict[str, Any]:
     manifest = read_manifest(folder / MANIFEST) if (folder / MANIFEST).is_file() else None
     if manifest is None:
         raise FileNotFoundError(f"load_sweep: `folder` must hold a sweep; received {folder}, without a {MANIFEST}.")
-    files = _Files(folder, manifest)
     if not all(isinstance(manifest.get(key), int) for key in ("chunks", "chunk", "members")):
         raise ValueError(f"load_sweep: {folder / MANIFEST} is damaged: make the sweep anew in another folder.")
+    files = _Files(folder, manifest)
     missing = [path.name for path in files.paths if not path.exists()]
     if missing:
         raise FileNotFoundError(
             f"load_sweep: {len(missing)} of {len(files.paths)} chunks are missing in {folder}, the first is "
-            f"{missing[0]}: repeat the call of sweep_to_disk, which goes on where it stopped."
+            f"{missing[0]}: repeat the call that wrote it, which goes on where it stopped."
         )
-    stored = files.arrays()
-    return stored if lazy else {name: np.asarray(x) for name, x in stored.items()}
+    return files.arrays() if lazy else files.all()
 
 
 class _Files:
@@ -73,8 +72,19 @@ class _Files:
                 return {name: part[name] for name in wanted}
         except (ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
             raise ValueError(
-                f"load_sweep: {path} is damaged ({error}): repeat the call of sweep_to_disk, which makes it anew."
+                f"load_sweep: {path} is damaged ({error}): repeat the call that wrote it, which makes it anew."
             ) from error
+
+    def all(self) -> dict[str, np.ndarray]:
+        """The arrays of all members, each file read once."""
+        parts = [self.read(k) for k in range(len(self.paths))]
+        for name in self.manifest.get("shortened") or ():
+            longest = max(part[name].shape[-1] for part in parts)
+            for part in parts:
+                x = part[name]
+                missing = [(0, 0)] * (x.ndim - 1) + [(0, longest - x.shape[-1])]
+                part[name] = np.pad(x, missing, constant_values=np.nan)
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def arrays(self) -> dict[str, StoredArray]:
         """All of them."""
@@ -119,19 +129,20 @@ class StoredArray:
         return (self[i] for i in range(len(self)))
 
     def __getitem__(self, index: Any) -> np.ndarray:
-        first, *rest = index if isinstance(index, tuple) else (index,)
-        if first is Ellipsis or first is None:
+        first, *rest = index if isinstance(index, tuple) and index else (index,)
+        simple = isinstance(first, (int, np.integer, slice)) or (np.ndim(first) == 1 and np.size(first) and not rest)
+        if not simple or not all(isinstance(x, (int, np.integer, slice)) or x is ... for x in rest):
             return self[:][index]
         members = np.arange(len(self))[first]
         found = self._of(np.atleast_1d(members))
-        found = found if np.ndim(members) else found[0]
-        return found[(slice(None), *rest)] if np.ndim(members) and rest else found[tuple(rest)] if rest else found
+        return found[(slice(None), *rest)] if np.ndim(members) else found[0][tuple(rest)]
 
     def _of(self, members: np.ndarray) -> np.ndarray:
         length = self._files.manifest["chunk"]
         found = np.full((len(members), *self.shape[1:]), np.nan if self._is_ragged else 0, self.dtype)
-        for k in np.unique(members // length):
-            here = members // length == k
+        chunks = members // length
+        for k in np.unique(chunks):
+            here = chunks == k
             part = self._files.read(int(k), [self._name])[self._name][members[here] - k * length]
             found[(here, *(slice(n) for n in part.shape[1:]))] = part
         return found

@@ -13,7 +13,7 @@ import numpy as np
 
 from hhtjax.checks import describe, require_integer
 from hhtjax.description import Array, PyTree, all_concrete, current, is_array, is_real
-from hhtjax.runs.executors import IN_FLIGHT, RETRIES, Chunks, Work, collected, require_executor
+from hhtjax.runs.executors import IN_FLIGHT, RETRIES, Chunks, Work, collected, require_executor, sent
 
 
 def parallel_map(
@@ -30,7 +30,7 @@ def parallel_map(
 
     What crosses is the compiled function's program (`jax.export`), the arrays that members share, and those of a chunk.
     So f may be defined anywhere, a notebook included; workers need hhtjax and the same JAX, and compile once each. The
-    values are those of the same call without an executor, bit by bit on processors of one kind.
+    values are those of the same call without an executor, bit by bit, for one `chunk` and on processors of one kind.
 
     Args:
         f: a function of one member's arguments, which JAX can trace; any pytree of arrays comes back. Host callbacks
@@ -39,7 +39,7 @@ def parallel_map(
         executor: any `concurrent.futures.Executor`: `ProcessPoolExecutor` with
             mp_context=multiprocessing.get_context("spawn"), Dask's `client.get_executor()`, `MPIPoolExecutor` of
             mpi4py. None: this process does it.
-        chunk: members in a task, at most. Seconds of work in each: to hand one out takes about a millisecond.
+        chunk: members in a task, at most. Choose seconds of work for each, since to hand one out takes a millisecond.
         in_axes: for each argument, or for branches of it, 0, or None where members share it.
         in_flight: tasks handed out and not yet returned, at most; take twice as many as there are workers.
         retries: how often a task that failed is tried again.
@@ -74,6 +74,13 @@ def work_of(caller: str, f: Callable, arguments: tuple, in_axes: Any, chunk: int
     """The `Work` of a function of members, or an error for what it is to be called with."""
     if not callable(f):
         raise TypeError(f"{caller}: `f` must be a function of one member's arguments; received {f!r}.")
+    try:
+        hash(f)
+    except TypeError:
+        raise TypeError(
+            f"{caller}: `f` must be hashable; received {type(f).__name__}. Pass what it holds as an argument, with "
+            "None in `in_axes`."
+        ) from None
     chunk = require_integer(caller, "chunk", chunk)
     if not arguments:
         raise TypeError(f"{caller}: give `arguments` behind `f`, arrays with a leading axis; received none.")
@@ -81,7 +88,7 @@ def work_of(caller: str, f: Callable, arguments: tuple, in_axes: Any, chunk: int
         raise TypeError(f"{caller}: all arguments must be known: call it outside jit, vmap and grad.")
     leaves, structure = jax.tree.flatten(arguments)
     for x in leaves:
-        if not (is_array(x) or is_real(x)):
+        if not (is_real(x) or (is_array(x) and (_is_key(x) or x.dtype.kind in "biufc"))):
             raise TypeError(f"{caller}: `arguments` must be pytrees of arrays and numbers; received {x!r}.")
     mapped = _mapped(caller, arguments, in_axes)
     sizes = {jnp.shape(x)[0] if jnp.ndim(x) else 0 for x, flag in zip(leaves, mapped, strict=True) if flag}
@@ -91,9 +98,9 @@ def work_of(caller: str, f: Callable, arguments: tuple, in_axes: Any, chunk: int
             f"{describe(arguments)}, in_axes={in_axes!r}."
         )
     kinds = tuple(str(jax.random.key_impl(x)) if _is_key(x) else None for x in leaves)
-    arrays = [np.asarray(jax.random.key_data(x) if kind else _strong(x)) for x, kind in zip(leaves, kinds, strict=True)]
-    shared = [x for x, flag in zip(arrays, mapped, strict=True) if not flag]
-    of_members = [x for x, flag in zip(arrays, mapped, strict=True) if flag]
+    arrays = [jax.random.key_data(x) if kind else x for x, kind in zip(leaves, kinds, strict=True)]
+    shared = [sent(x) for x, flag in zip(arrays, mapped, strict=True) if not flag]
+    of_members = [np.asarray(x, jnp.result_type(x)) for x, flag in zip(arrays, mapped, strict=True) if flag]
 
     def own(members: np.ndarray) -> list:
         return [x[members] for x in of_members]
@@ -117,7 +124,7 @@ class _Mapped:
         leaves = [_as_given(next(parts[flag]), kind) for flag, kind in rows]
         found = jax.vmap(self._one, [0 if flag else None for flag in self.mapped])(*leaves)
         if any(map(_is_key, jax.tree.leaves(found))):
-            raise TypeError("parallel_map: `f` must return arrays of numbers; received keys: take jax.random.key_data.")
+            raise TypeError("`f` must return arrays of numbers; received keys of jax.random: take their key_data.")
         return found
 
     def _one(self, *leaves: Array) -> PyTree:
@@ -126,12 +133,14 @@ class _Mapped:
 
 def _mapped(caller: str, arguments: tuple, in_axes: Any) -> tuple:
     """For each leaf whether it has the axis of members."""
-    axes = in_axes if isinstance(in_axes, (tuple, list)) else (in_axes,) * len(arguments)
+    axes = tuple(in_axes) if isinstance(in_axes, (tuple, list)) else (in_axes,) * len(arguments)
     try:
-        axes = jax.tree.broadcast(tuple(axes), arguments, is_leaf=lambda x: x is None)
-    except ValueError:
-        axes = (1,)
-    flags = jax.tree.leaves(axes, is_leaf=lambda x: x is None)
+        flags = jax.tree.map(
+            lambda axis, part: [axis] * len(jax.tree.leaves(part)), axes, arguments, is_leaf=lambda x: x is None
+        )
+        flags = jax.tree.leaves(flags, is_leaf=lambda x: x is None)
+    except (ValueError, TypeError):
+        flags = [1]
     if not all(axis is None or (type(axis) is int and axis == 0) for axis in flags):
         raise ValueError(
             f"{caller}: `in_axes` must be 0 or None for each argument, or a pytree of these for branches of it; "
@@ -146,8 +155,3 @@ def _as_given(x: Array, kind: str | None) -> Array:
 
 def _is_key(x: Any) -> bool:
     return is_array(x) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-
-
-def _strong(x: Any) -> Any:
-    """A number in the dtype that JAX gives it."""
-    return x if is_array(x) else np.asarray(x, jnp.result_type(x))

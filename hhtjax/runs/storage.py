@@ -59,6 +59,14 @@ class Npz(NamedTuple):
         except (OSError, ValueError, zipfile.BadZipFile):
             return False
 
+    def left(self, chunks: int) -> list[int]:
+        """Which are not there yet."""
+        return [k for k in range(chunks) if not self.holds(k)]
+
+    def missing(self, these: Sequence[int]) -> list[int]:
+        """Which of those that were written are not here."""
+        return [k for k in these if not self.path(k).exists()]
+
     def write(self, k: int, kept: int, arrays: Sequence[np.ndarray]):
         """A chunk; where another process has written it meanwhile, its file is replaced by the same."""
         marks = {NUMBER: np.asarray(k), INPUTS: np.asarray(self.inputs)}
@@ -69,7 +77,8 @@ class Npz(NamedTuple):
         """Writes the manifest, or compares it with the one that is there."""
         path = self.folder / MANIFEST
         if not path.exists():
-            if stray := sorted(self.folder.glob("chunk-*.npz")):
+            stray = sorted(self.folder.glob("chunk-*.npz"))
+            if stray and not path.exists():  # by now another caller may have begun
                 raise ValueError(
                     f"{self.caller}: `folder` {self.folder} holds {stray[0].name}, but no {MANIFEST} that tells of "
                     "which sweep: nothing was changed there; choose another folder, or empty it."
@@ -81,7 +90,7 @@ class Npz(NamedTuple):
 
     def end(self):
         """Removes what workers that died have left."""
-        for path in self.folder.glob(".chunk-*.part"):
+        for path in self.folder.glob(".*.part"):
             path.unlink(missing_ok=True)
 
 
@@ -107,9 +116,11 @@ def write_whole(caller: str, path: Path, fill: Callable[[Any], Any]):
             descriptor = os.open(path.parent, os.O_RDONLY)
             os.fsync(descriptor)
             os.close(descriptor)
-    except FileNotFoundError:
+    except FileNotFoundError as error:
         if not path.exists():  # else another writer was done, and its caller has tidied up
-            raise
+            raise FileNotFoundError(
+                error.errno, f"{caller}: {path} cannot be written: the folder must be there, for workers too"
+            ) from error
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise OSError(

@@ -18,15 +18,15 @@ import numpy as np
 from hhtjax.checks import require_integer, require_one_of
 from hhtjax.description import VERSION, PyTree, Real, all_concrete
 from hhtjax.runs.adaptive import Adaptive
-from hhtjax.runs.executors import IN_FLIGHT, RETRIES, Chunks, Work, require_executor, show
+from hhtjax.runs.executors import IN_FLIGHT, RETRIES, Chunks, Work, require_executor, sent, show
 from hhtjax.runs.output import require_output
 from hhtjax.runs.parallel_map import work_of
-from hhtjax.runs.storage import Names, Npz
+from hhtjax.runs.storage import INPUTS, NUMBER, Names, Npz
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.runs.sweep_controlled import sweep_chosen
 from hhtjax.runs.sweep_inputs import Inputs
 from hhtjax.runs.workers import written
-from hhtjax.runs.zarr_store import Zarr
+from hhtjax.runs.zarr_store import WRITTEN, Zarr
 from hhtjax.steppers.stepper import Stepper
 from hhtjax.systems.events import Event
 from hhtjax.systems.system import AnySystem
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 FORMATS = "npz", "zarr"
 # of `Inputs`, as `run_sweep` takes them
 ARRAYS = "system", "data", "dts", "duration", "t0", "times", "events", "output"
+
+RESERVED = "file", NUMBER, INPUTS, WRITTEN
 
 
 def sweep_to_disk(
@@ -74,8 +76,8 @@ def sweep_to_disk(
     all. A sweep that was interrupted, at whatever moment, is continued by the same call, and ends with the same files.
 
     With an executor its workers run the chunks and write the files, in any order: they need the folder, hhtjax and the
-    same JAX, and compile once each. The values are those without, bit by bit on processors of one kind. Several calls
-    with the same inputs may write to one folder at a time.
+    same JAX, and compile once each. The values are those without one, bit by bit on processors of one kind. Several
+    calls with the same inputs may write to one folder at a time.
 
     Args:
         folder: made if it does not exist.
@@ -118,8 +120,9 @@ def sweep_to_disk(
     require_one_of(caller, "format", format, FORMATS)
     by_errors = isinstance(inputs.dts, Adaptive)
     shortened = ("dt", "steps.dt") if by_errors else ()
+    folder = Path(folder).absolute()  # of the caller, wherever workers run
     return _store(
-        caller, Path(folder), format, _work(inputs, chunk), hands, progress, shortened, "sample", inputs.num_samples + 1
+        caller, folder, format, _work(inputs, chunk), hands, progress, shortened, "sample", inputs.num_samples + 1
     )
 
 
@@ -163,7 +166,7 @@ def map_to_disk(
     work = work_of(caller, f, arguments, in_axes, chunk)
     hands = require_executor(caller, executor, in_flight, retries, progress)
     require_one_of(caller, "format", format, FORMATS)
-    return _store(caller, Path(folder), format, work, hands, progress)
+    return _store(caller, Path(folder).absolute(), format, work, hands, progress)
 
 
 def _store(
@@ -182,6 +185,7 @@ def _store(
     chunks, paths = work.chunks, jax.tree_util.tree_leaves_with_path(work.like())
     names = Names(tuple(jax.tree_util.keystr(path, simple=True, separator=".") or "result" for path, _ in paths))
     like = [x for _, x in paths]
+    _require_names(caller, names.all, like)
     inputs = _hash(work)
     manifest = {"inputs": inputs, "members": chunks.size, "chunk": chunks.length, "chunks": chunks.number}
     manifest["versions"] = {"hhtjax": VERSION, "jax": version("jax"), "numpy": np.__version__}
@@ -195,7 +199,7 @@ def _store(
             manifest["shortened"] = list(names.shortened)
         store = Npz(caller, folder, inputs, names)
         store.begin(manifest)
-    left = [k for k in range(chunks.number) if not store.holds(k)]
+    left = store.left(chunks.number)
     if hands is None:
         for done, k in enumerate(left, 1):
             store.write(k, chunks.kept(k), work.here(k))
@@ -203,28 +207,47 @@ def _store(
                 show(done, len(left))
     elif left:
         program = work.packed(caller)
-        hands.work(
-            written,
-            chunks,
-            left,
-            lambda k: (program, work.arrays(k), partial(store.write, k, chunks.kept(k))),
-            lambda k, result: None,
-        )
+
+        def arguments(k: int, ticket: tuple):
+            return program, work.arrays(k), ticket, partial(store.write, k, chunks.kept(k))
+
+        hands.work(written, chunks, left, arguments, lambda k, result: None)
+        if lost := store.missing(left):
+            raise RuntimeError(
+                f"{caller}: workers wrote {len(lost)} chunks that are not in {folder}: all have to see one folder."
+            )
     store.end()
     return folder
+
+
+def _require_names(caller: str, names: tuple[str, ...], like: list):
+    """An error for results that files cannot hold by their names, or at all."""
+    for name, x in zip(names, like, strict=True):
+        if names.count(name) > 1 or name in RESERVED or "/" in name:
+            raise ValueError(
+                f"{caller}: results must have names of their own, without '/', and not {', '.join(RESERVED)}; received "
+                f"{name!r}."
+            )
+        if x.dtype.kind not in "biufc":
+            raise TypeError(f"{caller}: results must be of a dtype of NumPy; received {x.dtype} for {name!r}.")
 
 
 def _dims(name: str, shape: tuple, axis: str | None, length: int) -> tuple[str, ...]:
     """Names of the axes behind that of the members."""
     names = [f"{name}_{i}" for i in range(1, len(shape))]
-    return (axis, *names[1:]) if axis is not None and shape[1:2] == (length,) else tuple(names)
+    is_sampled = (
+        axis is not None and shape[1:2] == (length,) and not name.startswith(("dt", "steps", "events", "failure"))
+    )
+    return (axis, *names[1:]) if is_sampled else tuple(names)
 
 
 def _hash(work: Work) -> str:
     """Of the program and all that it is called with."""
     digest = hashlib.sha256(work.text().encode())
     for x in [*work.shared, *work.own(np.arange(work.chunks.size))]:
-        digest.update(f"{x.shape} {x.dtype}".encode() + x.tobytes())
+        x = np.ascontiguousarray(x)
+        digest.update(f"{x.shape} {x.dtype}".encode())
+        digest.update(x.data if x.size else b"")
     digest.update(f"{work.chunks.length}".encode())
     return digest.hexdigest()
 
@@ -247,9 +270,8 @@ def _work(inputs: Inputs, chunk: int) -> Work:
     of_dts = [jnp.ndim(x) > 0 for x in jax.tree.leaves(inputs.dts)]
     behind = jax.tree.leaves(tree[3:])
     mapped = [False] * len(jax.tree.leaves(inputs.system)) + [*inputs.mapped, *of_dts] + [False] * len(behind)
-    arrays = [np.asarray(x) for x in leaves]
-    shared = [x for x, flag in zip(arrays, mapped, strict=True) if not flag]
-    of_members = [x for x, flag in zip(arrays, mapped, strict=True) if flag]
+    shared = [sent(x) for x, flag in zip(leaves, mapped, strict=True) if not flag]
+    of_members = [np.asarray(x) for x, flag in zip(leaves, mapped, strict=True) if flag]
     rest = inputs._replace(size=chunks.length, **dict.fromkeys(ARRAYS))
     f = _Swept(structure, tuple(mapped), tuple(rest), tuple(sorted(static.items())), by_errors)
     return Work(f, shared, lambda members: [x[members] for x in of_members], chunks, fitting)

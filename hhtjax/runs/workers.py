@@ -13,7 +13,7 @@ import threading
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,16 +33,15 @@ class Unfit(RuntimeError):
 
 
 class Packed(NamedTuple):
-    """A program on its way. key: its hash, by which a worker knows it; content: bytes, with the arrays that all chunks
-    share."""
+    """A program on its way. key: its hash, by which a worker knows it; shared: arrays that it takes for all chunks."""
 
     key: str
     content: bytes
+    shared: list
 
 
 class _Content(NamedTuple):
     program: bytes  # of jax.export
-    shared: list
     options: dict  # of the compiler
     x64: bool
     platform: str
@@ -57,19 +56,20 @@ def versions() -> dict[str, str]:
 def packed(exported: jax.export.Exported, shared: list, options: dict) -> Packed:
     """A program of lists, (shared, own) -> leaves, with the first of them."""
     x64, platform = jnp.result_type(float) == np.float64, exported.platforms[0]
-    content = _Content(bytes(exported.serialize()), shared, options, x64, platform, versions())
+    content = _Content(bytes(exported.serialize()), options, x64, platform, versions())
     data = zlib.compress(pickle.dumps(tuple(content)))
-    return Packed(hashlib.sha256(data).hexdigest(), data)
+    return Packed(hashlib.sha256(data).hexdigest(), data, [np.asarray(x, jnp.result_type(x)) for x in shared])
 
 
-def results(program: Packed, own: list) -> list[np.ndarray]:
-    """On a worker: what the program makes of the arrays of a chunk."""
-    return _here(program)(own)
+def results(program: Packed, own: list, ticket: Any) -> list[np.ndarray]:
+    """On a worker: what the program makes of the arrays of a chunk. ticket: makes one task differ from another, since
+    Dask takes two that are equal for one."""
+    return _here(program)(program.shared, own)
 
 
-def written(program: Packed, own: list, write: Callable[[list], None]):
+def written(program: Packed, own: list, ticket: Any, write: Callable[[list], None]):
     """The same, handed to a function that writes it where the worker is."""
-    write(results(program, own))
+    write(results(program, own, ticket))
 
 
 def _here(program: Packed) -> Callable:
@@ -89,22 +89,21 @@ def _here(program: Packed) -> Callable:
 
 
 def _compiled(content: _Content) -> Callable:
-    """Arrays of a chunk -> results."""
+    """Shared arrays and those of a chunk -> results."""
     if content.versions != versions():
         raise Unfit(f"a worker must have the caller's versions, {content.versions}; it has {versions()}.")
-    if jax.default_backend() != content.platform:
+    if (platform := jax.export.default_export_platform()) != content.platform:
         raise Unfit(
-            f"a worker must compute on the caller's platform, {content.platform!r}; its JAX takes "
-            f"{jax.default_backend()!r}: set JAX_PLATFORMS there."
+            f"a worker must compute on the caller's platform, {content.platform!r}; its JAX takes {platform!r}: set "
+            "JAX_PLATFORMS there."
         )
     exported = jax.export.deserialize(bytearray(content.program))
     with _bits(content.x64):
         like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in exported.in_avals]
         arguments, _ = jax.tree.unflatten(exported.in_tree, like)
         call = jax.jit(exported.call, compiler_options=content.options).lower(*arguments).compile()
-        shared = jax.device_put(content.shared)
 
-    def run(own: list) -> list[np.ndarray]:
+    def run(shared: list, own: list) -> list[np.ndarray]:
         with _bits(content.x64):
             return [np.asarray(x) for x in call(shared, own)]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import uuid
 import warnings
 from collections.abc import Sequence
@@ -27,9 +28,14 @@ class Zarr(NamedTuple):
     dims: tuple[tuple[str, ...], ...]
     length: int
 
-    def holds(self, k: int) -> bool:
-        """Whether all arrays of a chunk are there."""
-        return bool(open_zarr(self.caller, self.folder)[WRITTEN][k])
+    def left(self, chunks: int) -> list[int]:
+        """Which are not there yet."""
+        written = np.asarray(open_zarr(self.caller, self.folder)[WRITTEN][:])
+        return [k for k in range(chunks) if not written[k]]
+
+    def missing(self, these: Sequence[int]) -> list[int]:
+        """Which of those that were written are not here."""
+        return sorted(set(these) & set(self.left(max(these) + 1)))
 
     def write(self, k: int, kept: int, arrays: Sequence[np.ndarray]):
         """The arrays of a chunk, and then that they are there."""
@@ -76,7 +82,13 @@ class Zarr(NamedTuple):
         )
         group.attrs[ATTRIBUTE] = manifest
         _consolidate(group)
-        os.replace(making, self.folder)
+        try:
+            os.replace(making, self.folder)
+        except OSError:  # another caller was faster
+            shutil.rmtree(making)
+            if not (self.folder / "zarr.json").exists():
+                raise
+            self.begin(manifest, like)
 
     def end(self):
         """Nothing is left over."""
@@ -109,7 +121,7 @@ def zarr_arrays(folder: Path, lazy: bool) -> dict[str, Any]:
     if not written.all():
         raise FileNotFoundError(
             f"load_sweep: {np.sum(~written)} of {len(written)} chunks are missing in {folder}, the first is number "
-            f"{int(np.argmin(written))}: repeat the call of sweep_to_disk, which goes on where it stopped."
+            f"{int(np.argmin(written))}: repeat the call that wrote it, which goes on where it stopped."
         )
     arrays = {name: x for name, x in group.arrays() if name != WRITTEN}
     return arrays if lazy else {name: x[:] for name, x in arrays.items()}

@@ -64,9 +64,9 @@ def run(report, fast):
             over, repeated = simulated(n, each, task_s, rng)
             share[n].append(1 / over)
             again[n] = max(again[n], repeated)
-        report.progress(f"queue: {n} workers, shares {[round(x, 2) for x in share[n]]}")
+        report.progress(f"on paper: {n} workers, shares {[round(x, 2) for x in share[n]]}")
     if not fast:
-        report.figure("sweeps_queue", figure(seconds, share))
+        report.figure("sweeps_on_paper", figure(seconds, share))
     return {
         "task_s": task_s,
         "compiling_s": COMPILING,
