@@ -113,7 +113,7 @@ def test_dask_gives_the_same_bits(tmp_path):
     from distributed import Client, LocalCluster
 
     with (
-        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
         Client(cluster) as client,
     ):
         found = hhtjax.parallel_map(end, K, 0.1, executor=client.get_executor(), chunk=3, in_axes=(0, None))

@@ -82,9 +82,9 @@ def count_compilations():
     flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
 
-    def listen(event, seconds, **_):
+    def listen(event, duration_secs, **_):
         if event.endswith("backend_compile_duration"):
-            compilations.append(seconds)
+            compilations.append(duration_secs)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
 
@@ -109,7 +109,7 @@ def dask(number):
     from distributed import Client, LocalCluster
 
     with (
-        LocalCluster(n_workers=number, threads_per_worker=1, dashboard_address=None) as cluster,
+        LocalCluster(n_workers=number, threads_per_worker=1, dashboard_address=":0") as cluster,
         Client(cluster) as client,
     ):
         client.run(count_compilations)

@@ -45,11 +45,11 @@ class Many(NamedTuple):
         structure = jax.tree.structure((params0, shared, records))
         given = [sent(x) for x in jax.tree.leaves((params0, shared))]
         of_records = [w, *(np.asarray(x) for x in jax.tree.leaves(records))]
-        by = [
-            self._evaluated(_Records(residuals, options, structure, rows), given, of_records, len(w), p)
-            for rows in (False, True)
-        ]
-        return ManyRecords(*by, p, w.shape)
+        triangles, rows = (
+            self._evaluated(_Records(residuals, options, structure, of_rows), given, of_records, len(w), p)
+            for of_rows in (False, True)
+        )
+        return ManyRecords(triangles, rows, p, w.shape)
 
     def _evaluated(self, f: _Records, shared: list, of_records: list, count: int, p: int) -> Callable:
         """x -> results for all records."""
@@ -84,7 +84,7 @@ class _Records:
     structure: Any
     rows: bool
 
-    def __call__(self, shared: list, own: list) -> dict[str, Array]:
+    def __call__(self, shared: list, own: list) -> dict[str, Any]:
         x, own_x, w, *records = own
         params0, data, (starts, records) = jax.tree.unflatten(self.structure, [*shared, *records])
         data = data._replace(starts=starts, records=records)

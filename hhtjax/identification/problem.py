@@ -354,17 +354,17 @@ def solve_on_host(
         with np.errstate(**warned):  # the user's functions may be traced here
             return _see(residuals, options, x, params0, data, rows)
 
+    elsewhere = None
     if many is not None:
         _require_equal_steps(kind)
-        problem = many.problem(residuals, options, params0, data, w, kind.p)
-    else:
-        problem = HostProblem(see) if w.ndim == 1 else HostRecords(see, kind.p, len(w))
+        elsewhere = many.problem(residuals, options, params0, data, w, kind.p)
+    problem = elsewhere or (HostProblem(see) if w.ndim == 1 else HostRecords(see, kind.p, len(w)))
     longest = longest_steps(options.transforms, jax.tree.leaves(params0), x0.size - kind.p)
     with np.errstate(all="ignore"):
         limits = limits_of(options, data, x0)
         best, history, iterations, code = levenberg_marquardt(problem, x0, longest, *limits)
-        if many is not None:
-            best = best._replace(read=_in_numpy(see(best.x, problem.rows(best.x))).read)
+        if elsewhere is not None:
+            best = best._replace(read=_in_numpy(see(best.x, elsewhere.rows(best.x))).read)
         found, kept = _solution(best, (history, iterations, code.astype(np.int32), None), kind, w, options.segments)
         if code == BAD_START:
             options = options._replace(covariance=False)  # of numbers that are not finite

@@ -69,7 +69,7 @@ class Npz(NamedTuple):
 
     def write(self, k: int, kept: int, arrays: Sequence[np.ndarray]):
         """A chunk; where another process has written it meanwhile, its file is replaced by the same."""
-        marks = {NUMBER: np.asarray(k), INPUTS: np.asarray(self.inputs)}
+        marks: dict[str, Any] = {NUMBER: np.asarray(k), INPUTS: np.asarray(self.inputs)}
         named = self.names.given(arrays, kept)
         write_whole(self.caller, self.path(k), lambda file: np.savez(file, **named, **marks))
 

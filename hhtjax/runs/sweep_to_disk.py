@@ -39,7 +39,7 @@ FORMATS = "npz", "zarr"
 # of `Inputs`, as `run_sweep` takes them
 ARRAYS = "system", "data", "dts", "duration", "t0", "times", "events", "output"
 
-RESERVED = "file", NUMBER, INPUTS, WRITTEN
+RESERVED = "file", "allow_pickle", NUMBER, INPUTS, WRITTEN
 
 
 def sweep_to_disk(
@@ -235,10 +235,8 @@ def _require_names(caller: str, names: tuple[str, ...], like: list):
 def _dims(name: str, shape: tuple, axis: str | None, length: int) -> tuple[str, ...]:
     """Names of the axes behind that of the members."""
     names = [f"{name}_{i}" for i in range(1, len(shape))]
-    is_sampled = (
-        axis is not None and shape[1:2] == (length,) and not name.startswith(("dt", "steps", "events", "failure"))
-    )
-    return (axis, *names[1:]) if is_sampled else tuple(names)
+    is_sampled = shape[1:2] == (length,) and not name.startswith(("dt", "steps", "events", "failure"))
+    return (axis, *names[1:]) if axis and is_sampled else tuple(names)
 
 
 def _hash(work: Work) -> str:

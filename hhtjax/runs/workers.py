@@ -112,5 +112,8 @@ def _compiled(content: _Content) -> Callable:
 
 def _bits(x64: bool):
     """A context in which JAX has 64 bits, or not, by the name that this JAX has for it."""
-    context = jax.enable_x64 if hasattr(jax, "enable_x64") else jax.experimental.enable_x64
-    return context(x64)
+    if hasattr(jax, "enable_x64"):
+        return jax.enable_x64(x64)
+    from jax.experimental import enable_x64  # type: ignore[attr-defined]
+
+    return enable_x64(x64)

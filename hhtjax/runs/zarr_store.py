@@ -103,7 +103,7 @@ def _consolidate(group: Any):
         zarr.consolidate_metadata(group.store)
 
 
-def open_zarr(caller: str, folder: Path, mode: str = "r") -> Any:
+def open_zarr(caller: str, folder: Path, mode: Any = "r") -> Any:
     """The group of a store."""
     try:
         import zarr
