@@ -62,7 +62,7 @@ def run(report, fast):
     for n in workers:
         for each in seconds:
             over, repeated = simulated(n, each, task_s, rng)
-            share[n].append(1 / over)
+            share[n].append(float(1 / over))
             again[n] = max(again[n], repeated)
         report.progress(f"on paper: {n} workers, shares {[round(x, 2) for x in share[n]]}")
     if not fast:

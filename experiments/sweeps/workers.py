@@ -25,7 +25,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 MEMBERS, CHUNK, STEPS = 240_000, 20_000, 5000
 FAST_MEMBERS, FAST_CHUNK, FAST_STEPS = 40, 10, 20
-KILLS, KILLED_MEMBERS = 20, 200_000
+KILLS, KILLED_MEMBERS, PARTS = 20, 2_000_000, 400
 MANY, SMALL = 1_000_000, 20_000  # members, few steps each: what the caller's memory holds
 TASKS = 1000  # without work
 
@@ -89,7 +89,7 @@ def count_compilations():
     jax.monitoring.register_event_duration_secs_listener(listen)
 
 
-def told():
+def told(_):
     """The process, and what it has compiled, after a moment in which the others are asked, too."""
     time.sleep(0.3)
     return os.getpid(), len(compilations)
@@ -140,7 +140,7 @@ def timed(kind, number, members, chunk, steps):
             start = time.perf_counter()
             where = swept(Path(folder) / "all", members, chunk, steps, pool)
             seconds = time.perf_counter() - start
-            futures = [pool.submit(told) for _ in range(2 * number)]
+            futures = [pool.submit(told, i) for i in range(4 * number)]
             compiled = dict(future.result() for future in futures)
             start = time.perf_counter()
             for future in [pool.submit(int, i) for i in range(TASKS)]:
@@ -191,7 +191,7 @@ def caller_killed(members, chunk, steps, kills):
             )
             try:
                 if count < kills:
-                    process.wait(timeout=random.uniform(3, 8))
+                    process.wait(timeout=random.uniform(3.5, 6))
                 else:
                     process.wait()
                 ended = process.returncode == 0
@@ -323,11 +323,11 @@ def run(report, fast):
     report.table(["", "s"], [[name, x["seconds"]] for name, x in found.items()])
     if fast:
         return numbers
-    known = case("timed", "none", 0, KILLED_MEMBERS, KILLED_MEMBERS // 40, steps)["hash"]
+    known = case("timed", "none", 0, KILLED_MEMBERS, KILLED_MEMBERS // PARTS, steps)["hash"]
     lost = {}
     if is_there("Dask"):
-        lost["workers of Dask"] = case("killed", "Dask", 2, KILLED_MEMBERS, KILLED_MEMBERS // 40, steps, KILLS)
-    lost["callers"] = case("caller_killed", KILLED_MEMBERS, KILLED_MEMBERS // 40, steps, KILLS)
+        lost["workers of Dask"] = case("killed", "Dask", 2, KILLED_MEMBERS, KILLED_MEMBERS // PARTS, steps, KILLS)
+    lost["callers"] = case("caller_killed", KILLED_MEMBERS, KILLED_MEMBERS // PARTS, steps, KILLS)
     numbers["killed"] = {name: {"kills": x["kills"], "equal": x["hash"] == known} for name, x in lost.items()}
     numbers["memory_MB"] = case("memory", MANY, SMALL)
     report.progress(f"workers: {numbers['killed']}, {numbers['memory_MB']}")
