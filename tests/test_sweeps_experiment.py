@@ -21,6 +21,11 @@ def test_the_committed_numbers_hold_what_is_claimed():
     assert COMMITTED["map"]["members"] == 100_000
     assert COMMITTED["map"]["peak_MB"] <= 1000
     assert COMMITTED["devices"]["bitwise_equal"]
+    workers = COMMITTED["workers"]
+    assert workers["bitwise_equal"]
+    assert all(x["equal"] and x["kills"] == 20 for x in workers["killed"].values())
+    assert all(set(row.get("compiled_by_each", [1])) == {1} for row in workers["rows"].values())
+    assert workers["fit"]["apart_in_standard_errors"] < 1e-3
     assert COMMITTED["real_time"]["median_over_empty_call"] <= 3
     for row in COMMITTED["real_time"]["rows"]:
         assert row.get("while_loops", 0) == (row["scene"] == "squeezer" and "while_loops" in row)

@@ -83,6 +83,6 @@ def figure(seconds, share):
     drawn, axes = subplots(1, 1, width=110, height=80)
     for (n, shares), colour, marker in zip(share.items(), COLOURS, MARKERS, strict=False):
         axes.semilogx(seconds, shares, color=colour, marker=marker, label=f"{n} workers")
-    axes.set(xlabel="work in a task, s", ylabel="share of time in which workers work", ylim=(0, 1.02))
+    axes.set(xlabel="work in a task (s)", ylabel="share of time in which workers work", ylim=(0, 1.02))
     legend(axes)
     return drawn
