@@ -167,10 +167,6 @@ WRONG = {
         lambda: hhtjax.sweep(SPRING, STEPPER, ONE, ZERO, PARAMS, dts=MANY, times=TIMES, mesh=jax.make_mesh((1,), "x")),
         "sweep: with dts=adaptive(...), leave `mesh` out.",
     ),
-    "disk": (
-        lambda: hhtjax.sweep_to_disk("no folder", SPRING, STEPPER, ONE, ZERO, PARAMS, dts=MANY),
-        "sweep_to_disk: `dts` must be step sizes; adaptive(...) is for `sweep`.",
-    ),
 }  # fmt: skip
 
 

@@ -13,6 +13,7 @@ import threading
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable
+from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import jax
@@ -50,7 +51,7 @@ class _Content(NamedTuple):
 
 def versions() -> dict[str, str]:
     """Of what has to be the same on both sides."""
-    return {"jax": jax.__version__, "hhtjax": VERSION}
+    return {"jax": version("jax"), "hhtjax": VERSION}
 
 
 def packed(exported: jax.export.Exported, shared: list, options: dict) -> Packed:
