@@ -1,5 +1,6 @@
 """How the documentation is built: `.ci/docs`. The texts are README, pages, notebooks and docstrings; none is here."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -51,3 +52,16 @@ html_math_renderer = "mathml"
 html_show_sphinx = False
 html_show_sourcelink = False
 html_copy_source = False
+
+
+def with_readme(_, name, source):
+    """The start page is README, whose links count from the folder above."""
+    if name == root_doc:
+        text = (Path(__file__).parents[1] / "README.md").read_text()
+        text = re.sub(r"\]\((?!https?:|docs/)", "](../", text).replace("](docs/", "](")
+        source[0] = source[0].replace("(README)\n", text)
+
+
+def setup(app):
+    """Called by Sphinx."""
+    app.connect("source-read", with_readme)

@@ -27,6 +27,8 @@ def test_the_code_blocks_run(capsys, monkeypatch, tmp_path):
             exec(compile(block, "README.md", "exec"), namespace)
     plt.close("all")
     printed = capsys.readouterr().out
+    shown = re.search(r"```\n(converged.*?)\.\.\.\n```", README, flags=re.DOTALL)[1]
+    assert shown.splitlines()[1:] == printed.splitlines()[1:4]
     assert "converged" in printed
     assert "resolves the mode" in printed
     assert "nan" not in printed
@@ -48,7 +50,7 @@ def test_the_two_commands_are_there():
 def test_the_times_of_other_packages_are_those_of_their_page():
     """Of the best of their methods at 1e-6, to the digits that are printed, and how often ours take theirs."""
     times = json.loads((ROOT / "experiments/work_precision/work_precision.json").read_text())["times"]
-    beside = README[README.index("## Beside other packages") : README.index("## How to cite")]
+    beside = README[README.index("## Beside other packages") : README.index("## Two commands")]
 
     def least(scene, package, level="1e-06"):
         every = [x["time_s"][level] for x in times[scene] if x["package"] == package]
@@ -76,7 +78,7 @@ def test_the_times_of_other_packages_are_those_of_their_page():
 
 
 def test_it_is_short():
-    assert len(README.splitlines()) <= 120
+    assert len(README.splitlines()) <= 150
 
 
 def test_what_it_links_to_exists():
