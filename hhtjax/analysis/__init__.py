@@ -12,7 +12,8 @@ grows before it decays, or for ever.
 '1.5e-04 8.5e-03'
 
 Which stepper a motion needs is answered by `choose_stepper`, which step by `suggest_step_size`; what a run made or lost
-by `energy_balance`; whether the error falls as it should by `observed_order`.
+by `energy_balance`; whether the error falls as it should by `observed_order`. `equilibrium` finds where a system is at
+rest.
 """
 
 from hhtjax.analysis.amplification import (
@@ -35,6 +36,8 @@ from hhtjax.analysis.convergence import ObservedOrder as ObservedOrder
 from hhtjax.analysis.convergence import observed_order
 from hhtjax.analysis.energy import EnergyBalance as EnergyBalance
 from hhtjax.analysis.energy import energy_balance
+from hhtjax.analysis.equilibrium import Equilibrium as Equilibrium
+from hhtjax.analysis.equilibrium import equilibrium
 from hhtjax.analysis.jordan import Eigenvalue as Eigenvalue
 from hhtjax.analysis.jordan import jordan_structure, transient_growth
 from hhtjax.analysis.modal import ModalReduction as ModalReduction
@@ -51,6 +54,7 @@ __all__ = [
     "constraint_matrix",
     "damping_ratio",
     "energy_balance",
+    "equilibrium",
     "jordan_structure",
     "modes",
     "observed_order",

@@ -1,0 +1,159 @@
+"""Where a system is at rest: positions, multipliers and internal states of a static equilibrium."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from hhtjax.checks import require_number, require_params
+from hhtjax.description import Array, PyTree, Real, all_concrete
+from hhtjax.description.presentation import shown
+from hhtjax.systems.constraints import reaction
+from hhtjax.systems.flat_system import flatten
+from hhtjax.systems.initial_conditions import initial_values
+from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_system
+from hhtjax.xla import Programs
+
+MOST = 200  # iterations
+BALANCED = 1e-8  # part of the forces that may be left of their sum; in float32 a thousandth
+
+
+@shown
+class Equilibrium(NamedTuple):
+    """What `equilibrium` found.
+
+    Attributes:
+        q: positions, like q0; of a first-order system y.
+        multipliers: L (m,), None without constraints.
+        z: internal states, like z0; None without.
+        left: the largest force, or violation of a constraint, that is left, over the largest there is.
+        converged: whether that is no more than rounding.
+    """
+
+    q: PyTree
+    multipliers: Array | None
+    z: PyTree
+    left: Array
+    converged: Array
+
+
+def equilibrium(
+    system: AnySystem, q0: PyTree, v0: PyTree = None, params: PyTree = None, *, t0: Real = 0.0, z0: PyTree = None
+) -> Equilibrium:
+    """A static equilibrium near q0:
+
+        Q(q, 0, z, t0) + B^T L = 0,    Phi(q, t0) = 0,    g(q, 0, z, t0) = 0
+
+    with the force Q, the constraints Phi and the rates g of internal states. It is found by the method of Levenberg and
+    Marquardt, so that a start from which Newton's method would run away is good enough. There may be several, stable
+    ones and others: `hhtjax.analysis.modes` at it tells.
+
+    Args:
+        system: a `System`, `LinearSystem` or `FirstOrderSystem`, without dry friction and contact.
+        q0: where to look, like the q0 of `simulate`.
+        v0: of a system with rotations, for its structure: angular velocities (3,). Its values are not used.
+        params, t0, z0: as in `simulate`.
+
+    Returns:
+        An `Equilibrium`, with derivatives in params, forward and reverse, where it is isolated. Under jit nothing
+        raises, and `converged` tells.
+
+    Raises:
+        TypeError, ValueError: an argument of a wrong kind or value; no equilibrium was found.
+        NotImplementedError: dry friction or contact, with which equilibria are not isolated.
+
+    >>> import jax, jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -9.81 - params["k"] * (q + q**3))
+    >>> sag = lambda k: hhtjax.analysis.equilibrium(spring, jnp.zeros(1), params={"k": k}).q[0]
+    >>> print(f"{sag(100.0):.5f} {jax.grad(sag)(100.0):.3e}")                    # q + q^3 = -mg/k
+    -0.09718 9.540e-04
+    """
+    require_system("equilibrium", system)
+    for name in ("friction", "contact"):
+        if getattr(system, name, None) is not None:
+            raise NotImplementedError(
+                f"equilibrium: `system` has {name}, with which bodies rest at many places. Simulate until it rests."
+            )
+    params = require_params("equilibrium", params)
+    require_number("equilibrium", "t0", t0, np.isfinite, "be finite")
+    if v0 is None and not isinstance(system, FirstOrderSystem):
+        v0 = jax.tree.map(jnp.zeros_like, q0)
+    q0, v0, z0 = initial_values("equilibrium", system, q0, v0, z0)
+    found = _equilibrium(system, q0, v0, params, t0, z0)
+    if all_concrete(found) and not found.converged:
+        raise ValueError(
+            f"equilibrium: none was found near `q0`: {float(found.left):.3g} of the forces is left. Start nearer; what "
+            "moves freely, as a body without springs, has none."
+        )
+    return found
+
+
+@Programs
+def _equilibrium(system: AnySystem, q0: PyTree, v0: PyTree, params: PyTree, t0: Real, z0: PyTree) -> Equilibrium:
+    flat, q, v = flatten("equilibrium", system, q0, v0, t0, params, z0)
+    n, N, m = flat.positions, flat.size, flat.num_constraints
+    t, still = jnp.asarray(t0).astype(v.dtype), jnp.zeros_like(v)
+
+    def place(y: Array):
+        """Position, rates and multipliers of the unknowns."""
+        return flat.move(q, jnp.where(np.arange(N) < n, y[:N], 0)), still.at[n:].set(v[n:] + y[n:N]), y[N:]
+
+    def parts(y: Array):
+        q, v, L = place(y)
+        pull = reaction(flat, q, t, params, L) if m else still
+        return flat.force(q, v, t, params), pull, flat.constraint(q, t, params) if m else still[:0]
+
+    def unbalanced(y: Array) -> Array:
+        Q, pull, Phi = parts(y)
+        return jnp.concatenate([Q + pull, Phi])
+
+    y = lax.custom_root(unbalanced, jnp.zeros(N + m, v.dtype), _nearest_root, _tangent)
+    (Q, pull, Phi), at = parts(y), place(y)
+    begun = parts(jnp.zeros_like(y))
+    size = jnp.maximum(jnp.max(jnp.abs(jnp.concatenate([Q, pull, begun[0]]))), jnp.finfo(v.dtype).tiny)
+    left = jnp.max(jnp.abs(Q + pull)) / size
+    if m:
+        left = jnp.maximum(left, jnp.max(jnp.abs(Phi)) / jnp.maximum(jnp.max(jnp.abs(begun[2])), 1))
+    enough = max(BALANCED, 1e4 * float(jnp.finfo(v.dtype).eps))
+    left = lax.stop_gradient(left)
+    z = flat.unravel_internal(at[1][n:]) if 0 < n < N else None
+    q = flat.unravel(at[0]) if n else flat.unravel(at[1])
+    return Equilibrium(q, at[2] if m else None, z, left, left <= enough)
+
+
+def _nearest_root(f, y: Array) -> Array:
+    """A y with f(y) = 0, by Levenberg and Marquardt: steps of (J^T J + lam D^2) dy = -J^T f, D of the columns of J."""
+
+    def look(y: Array):
+        r = f(y)
+        return r, jnp.sum(r**2)
+
+    def unfinished(carry: tuple) -> Array:
+        *_, moved, k = carry
+        return moved & (k < MOST)
+
+    def improve(carry: tuple):
+        y, r, cost, lam, _, k = carry
+        J = jax.jacfwd(f)(y)
+        D = jnp.sqrt(jnp.sum(J**2, axis=0))
+        D = jnp.where(D == 0, 1, D)
+        A = jnp.concatenate([J / D[None, :], jnp.sqrt(lam) * jnp.eye(y.size, dtype=y.dtype)])
+        dy = jnp.linalg.lstsq(A, jnp.concatenate([-r, jnp.zeros_like(y)]))[0] / D
+        new, there = look(y + dy)
+        better = there < cost  # NaN is not
+        little = jnp.max(jnp.abs(dy) * D) <= 4 * float(jnp.finfo(y.dtype).eps) * jnp.max(jnp.abs(y) * D)
+        y, r, cost = (jnp.where(better, a, b) for a, b in ((y + dy, y), (new, r), (there, cost)))
+        lam = jnp.clip(jnp.where(better, lam / 10, lam * 10), 1e-16, 1e8)
+        return y, r, cost, lam, (cost > 0) & ~little & (better | (lam < 1e8)), k + 1
+
+    begin = (y, *look(y), jnp.asarray(1e-3, y.dtype), jnp.asarray(True), jnp.zeros((), jnp.int32))
+    return lax.while_loop(unfinished, improve, begin)[0]
+
+
+def _tangent(g, b: Array) -> Array:
+    """x with g(x) = b, g being linear."""
+    return jnp.linalg.solve(jax.jacfwd(g)(jnp.zeros_like(b)), b)
