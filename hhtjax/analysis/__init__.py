@@ -36,14 +36,14 @@ from hhtjax.analysis.convergence import ObservedOrder as ObservedOrder
 from hhtjax.analysis.convergence import observed_order
 from hhtjax.analysis.energy import EnergyBalance as EnergyBalance
 from hhtjax.analysis.energy import energy_balance
-from hhtjax.analysis.equilibrium import Equilibrium as Equilibrium
-from hhtjax.analysis.equilibrium import equilibrium
 from hhtjax.analysis.jordan import Eigenvalue as Eigenvalue
 from hhtjax.analysis.jordan import jordan_structure, transient_growth
 from hhtjax.analysis.modal import ModalReduction as ModalReduction
 from hhtjax.analysis.modal import NormalModes as NormalModes
 from hhtjax.analysis.modal import modal_reduction as modal_reduction
 from hhtjax.analysis.modal import modes
+from hhtjax.analysis.statics import Equilibrium as Equilibrium
+from hhtjax.analysis.statics import equilibrium
 from hhtjax.analysis.step_size import Mode as Mode
 from hhtjax.analysis.step_size import StepSize as StepSize
 from hhtjax.analysis.step_size import suggest_step_size

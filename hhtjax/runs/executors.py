@@ -73,13 +73,14 @@ class Work(NamedTuple):
     """A function f(shared, own) of lists of arrays, hashable, and what it is called with for each chunk.
 
     shared: arrays, and Python numbers, which are weak; own: numbers of members -> theirs; fitting: of the system in it,
-    by which `Programs` choose."""
+    by which `Programs` choose; alone: the same function where this process has programs of its own for it."""
 
     f: Callable
     shared: list
     own: Callable[[np.ndarray], list]
     chunks: Chunks
     fitting: dict[str, Any]
+    alone: Callable | None = None
 
     def arrays(self, k: int) -> list:
         """Those of a chunk."""
@@ -91,7 +92,10 @@ class Work(NamedTuple):
 
     def here(self, k: int) -> list[np.ndarray]:
         """The leaves of what it returns for a chunk, by this process."""
-        return [np.asarray(x) for x in _leaves(self.f, self.shared, self.arrays(k), **self.fitting)]
+        given = self.shared, self.arrays(k)
+        if self.alone is not None:
+            return [np.asarray(x) for x in jax.tree.leaves(self.alone(*given))]
+        return [np.asarray(x) for x in _leaves(self.f, *given, **self.fitting)]
 
     def text(self) -> str:
         """What XLA is given, by which one program is told from another."""

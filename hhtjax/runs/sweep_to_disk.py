@@ -272,7 +272,8 @@ def _work(inputs: Inputs, chunk: int) -> Work:
     of_members = [np.asarray(x) for x, flag in zip(leaves, mapped, strict=True) if flag]
     rest = inputs._replace(size=chunks.length, **dict.fromkeys(ARRAYS))
     f = _Swept(structure, tuple(mapped), tuple(rest), tuple(sorted(static.items())), by_errors)
-    return Work(f, shared, lambda members: [x[members] for x in of_members], chunks, fitting)
+    alone = partial(f, program=partial(run_sweep, **fitting))  # that of `sweep`
+    return Work(f, shared, lambda members: [x[members] for x in of_members], chunks, fitting, alone)
 
 
 @dataclass(frozen=True)
@@ -285,9 +286,9 @@ class _Swept:
     static: tuple
     by_errors: bool
 
-    def __call__(self, shared: list, own: list) -> Solution:
+    def __call__(self, shared: list, own: list, program: Callable = run_sweep.usual) -> Solution:
         parts = iter(shared), iter(own)
         tree = jax.tree.unflatten(self.structure, [next(parts[flag]) for flag in self.mapped])
         if not self.by_errors:
-            return run_sweep.usual(*tree, **dict(self.static))
+            return program(*tree, **dict(self.static))
         return sweep_chosen(Inputs(*self.rest)._replace(**dict(zip(ARRAYS, tree, strict=True))), False)
