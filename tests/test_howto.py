@@ -22,7 +22,7 @@ def test_what_is_named_is_there(page):
     for name in re.findall(r"hhtjax((?:\.[A-Za-z_]\w*)+)", text):
         parts = name[1:].split(".")
         if parts[0] not in ("git", "cluster"):
-            reduce(getattr, parts, hhtjax)
+            assert reduce(lambda x, part: getattr(x, part, None), parts, hhtjax) is not None, name
     for block in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
         compile(block, page.name, "exec")
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from hhtjax.checks import require_integer
 from hhtjax.description import PyTree, is_array
-from hhtjax.description.presentation import overwrite
+from hhtjax.runs.progress import bar
 from hhtjax.runs.workers import Packed, Unfit, packed, results
 from hhtjax.xla import Programs
 
@@ -150,7 +150,7 @@ class Hands:
                 take(k, found)
                 done += 1
                 if self.progress:
-                    show(done, total)
+                    bar(done, total, "chunk")
         finally:
             for future in flying:
                 future.cancel()
@@ -233,15 +233,10 @@ def collected(work: Work, hands: Hands | None, progress: bool = False, program: 
         for k in range(chunks.number):
             take(k, work.here(k))
             if progress:
-                show(k + 1, chunks.number)
+                bar(k + 1, chunks.number, "chunk")
     return jax.tree.unflatten(structure, found)
 
 
 def sent(x: Any) -> Any:
     """A leaf as an array of NumPy; one of a weak type, such as a Python number, as it is."""
     return x if not is_array(x) or getattr(x, "weak_type", False) else np.asarray(x)
-
-
-def show(done: int, total: int):
-    """The bar."""
-    overwrite(f"[{'#' * (done * 40 // total):<40}] chunk {done} of {total}", last=done == total)

@@ -14,6 +14,7 @@ import numpy as np
 from hhtjax.checks import describe, require_integer
 from hhtjax.description import Array, PyTree, all_concrete, current, is_array, is_real
 from hhtjax.runs.executors import IN_FLIGHT, RETRIES, Chunks, Work, collected, require_executor, sent
+from hhtjax.runs.sweep_inputs import axis_of_each
 
 
 def parallel_map(
@@ -135,10 +136,7 @@ def _mapped(caller: str, arguments: tuple, in_axes: Any) -> tuple:
     """For each leaf whether it has the axis of members."""
     axes = tuple(in_axes) if isinstance(in_axes, (tuple, list)) else (in_axes,) * len(arguments)
     try:
-        flags = jax.tree.map(
-            lambda axis, part: [axis] * len(jax.tree.leaves(part)), axes, arguments, is_leaf=lambda x: x is None
-        )
-        flags = jax.tree.leaves(flags, is_leaf=lambda x: x is None)
+        flags = axis_of_each(axes, arguments)
     except (ValueError, TypeError):
         flags = [1]
     if not all(axis is None or (type(axis) is int and axis == 0) for axis in flags):

@@ -29,11 +29,12 @@ def show_progress(count: Array, total: int, what: str):
 def draw(count: Array, total: int, what: str):
     """The bar itself."""
 
-    def show(count: Array):
-        done = int(count) * 40 // total
-        overwrite(f"[{'#' * done:<40}] {what} {int(count)} of {total}", last=int(count) == total)
+    jax.debug.callback(lambda count: bar(int(count), total, what), count)
 
-    jax.debug.callback(show, count)
+
+def bar(count: int, total: int, what: str):
+    """The same of a number that is known."""
+    overwrite(f"[{'#' * (count * 40 // total):<40}] {what} {count} of {total}", last=count == total)
 
 
 def steps_between(total: int, unknowns: int) -> int:

@@ -264,16 +264,22 @@ def _initial_values(
     return values, tuple(flag for name in NAMES for flag in flags[name])
 
 
+def axis_of_each(axes: PyTree, tree: PyTree) -> list:
+    """For each leaf of `tree` what a prefix of it says, as the axes of `jax.vmap` are; ValueError or TypeError where it
+    is none."""
+    spread = jax.tree.map(lambda axis, part: [axis] * len(jax.tree.leaves(part)), axes, tree, is_leaf=_is_none)
+    return jax.tree.leaves(spread, is_leaf=_is_none)
+
+
 def _flags(name: str, tree: PyTree, axes: PyTree, size: int | None = None):
     """For each leaf of `tree` whether it has an axis of members, from a prefix of 0 and None as for `jax.vmap`."""
     try:
-        flags = jax.tree.map(lambda axis, part: [axis] * len(jax.tree.leaves(part)), axes, tree, is_leaf=_is_none)
+        flags = axis_of_each(axes, tree)
     except (ValueError, TypeError):
         like, received = jax.tree.structure(tree), jax.tree.structure(axes, is_leaf=_is_none)
         raise ValueError(
             f"sweep: `in_axes` for {name} must be a prefix of its structure, {like}; received {received}."
         ) from None
-    flags = jax.tree.leaves(flags, is_leaf=_is_none)
     for (path, x), flag in zip(jax.tree_util.tree_leaves_with_path(tree), flags, strict=True):
         if flag is not None and (flag != 0 or isinstance(flag, bool)):
             raise ValueError(f"sweep: `in_axes` must hold 0 and None; received {flag!r} for {name}.")

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,16 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_integer, require_one_of
-from hhtjax.description import VERSION, PyTree, Real, all_concrete
+from hhtjax.description import PyTree, Real, all_concrete
 from hhtjax.runs.adaptive import Adaptive
-from hhtjax.runs.executors import IN_FLIGHT, RETRIES, Chunks, Work, require_executor, sent, show
+from hhtjax.runs.executors import IN_FLIGHT, RETRIES, Chunks, Work, require_executor, sent
 from hhtjax.runs.output import require_output
 from hhtjax.runs.parallel_map import work_of
+from hhtjax.runs.progress import bar
 from hhtjax.runs.storage import INPUTS, NUMBER, Names, Npz
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.runs.sweep_controlled import sweep_chosen
 from hhtjax.runs.sweep_inputs import Inputs
-from hhtjax.runs.workers import written
+from hhtjax.runs.workers import versions, written
 from hhtjax.runs.zarr_store import WRITTEN, Zarr
 from hhtjax.steppers.stepper import Stepper
 from hhtjax.systems.events import Event
@@ -188,7 +188,7 @@ def _store(
     _require_names(caller, names.all, like)
     inputs = _hash(work)
     manifest = {"inputs": inputs, "members": chunks.size, "chunk": chunks.length, "chunks": chunks.number}
-    manifest["versions"] = {"hhtjax": VERSION, "jax": version("jax"), "numpy": np.__version__}
+    manifest["versions"] = versions() | {"numpy": np.__version__}
     if format == "zarr":
         dims = tuple(_dims(name, x.shape, axis, length) for name, x in zip(names.all, like, strict=True))
         store = Zarr(caller, folder, inputs, names, dims, chunks.length)
@@ -204,7 +204,7 @@ def _store(
         for done, k in enumerate(left, 1):
             store.write(k, chunks.kept(k), work.here(k))
             if progress:
-                show(done, len(left))
+                bar(done, len(left), "chunk")
     elif left:
         program = work.packed(caller)
 

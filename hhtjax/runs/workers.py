@@ -51,7 +51,7 @@ class _Content(NamedTuple):
 
 def versions() -> dict[str, str]:
     """Of what has to be the same on both sides."""
-    return {"jax": version("jax"), "hhtjax": VERSION}
+    return {"hhtjax": VERSION, "jax": version("jax")}
 
 
 def packed(exported: jax.export.Exported, shared: list, options: dict) -> Packed:
