@@ -13,7 +13,7 @@ version = release = hhtjax.__version__
 copyright = "the authors of hhtjax, Apache-2.0"
 
 extensions = [
-    "myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_copybutton", "plain_text", "mathml",
+    "myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_copybutton", "plain_text", "mathml", "pages",
 ]  # fmt: skip
 
 # Sources lie where they are read on GitHub too, so that links between them hold in both places.

@@ -1,6 +1,6 @@
 """Docstrings as they are written here, for Sphinx: plain text, indented formulas, sections of Google's style.
 
-indented block after an empty line    a formula or a table, shown as it stands
+indented block after an empty line    a formula (`formulas`); a table or code is shown as it stands
 Args:, Returns:, Raises: ...          a list of what is named before the colon
 `name`                                a link if it is a public name or a page, else code
 Title over ----, table between ====   as in reStructuredText
@@ -14,6 +14,8 @@ import textwrap
 from pathlib import Path
 from types import ModuleType
 
+import formulas
+
 import hhtjax
 
 ROOT = Path(__file__).parents[1]
@@ -22,7 +24,7 @@ TITLES = {"Args": "Arguments"}
 HEADER = re.compile(rf"({'|'.join(SECTIONS)}):(?: (.+))?$")
 ITEM = re.compile(r"(\*{0,2}[A-Za-z_][\w]*(?:, \*{0,2}[A-Za-z_]\w*)*|\"\w+\"): ?(.*)")
 
-
+LIST = r"^(\* |)(?=\(?\w+[.)](\s|$))"  # "s." and initials, which begin no list
 MARK = r"\\|\||(?<![\w])\*(?!\w+\*(?!\w))(?!(?<=^\*) )"  # not *emphasis*, and no bullet
 
 
@@ -58,7 +60,7 @@ def inline(text):
             parts[i] = f":doc:`/{part.rpartition('.')[0]}`"
         else:
             parts[i] = f"``{part}``"
-    return re.sub(r"^(\w+\.)(?= )", r"\\\1", "".join(parts)) if re.match(r"\w\. ", text) else "".join(parts)
+    return re.sub(LIST, r"\1\\", "".join(parts), flags=re.MULTILINE)
 
 
 def indented(lines):
@@ -99,7 +101,11 @@ def render(lines, names=frozenset()):
         elif indentation(first):
             while remaining and indentation(remaining[0][0]):
                 block += ["", *remaining.pop(0)]
-            result += ["::", "", *indented(textwrap.dedent("\n".join(block)).split("\n"))]
+            block = textwrap.dedent("\n".join(block)).split("\n")
+            if formulas.is_formula(block):
+                result += [".. math::", "", f"    {formulas.latex([line for line in block if line])}"]
+            else:
+                result += ["::", "", *indented(block)]
         elif first.startswith((">>>", "===")) or (len(block) > 1 and set(block[1]) <= set("-=~")):
             title = not first.startswith((">>>", "==="))
             result += [*block[:2], "", *render(block[2:])] if title else [re.sub(r" {3,}# ", "  # ", x) for x in block]
