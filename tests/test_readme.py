@@ -77,6 +77,16 @@ def test_the_times_of_other_packages_are_those_of_their_page():
     assert (few, many, int(count)) == (f"{min(lost):.1f}", f"{max(lost):.1f}", len(lost))
 
 
+def test_first_calls_are_those_of_their_pages():
+    compiled = json.loads((ROOT / "experiments/benchmarks/benchmarks.json").read_text())["compile_time"]["rows"]
+    told = re.search(r"([\d.]+) s for `hht`, ([\d.]+) s for diffrax", README).groups()
+    runs = {x["method"]: x["compile_s"] for x in compiled if x["compiled"] == "run"}
+    assert told == tuple(f"{runs[name]:.2f}" for name in ("hht, auto", "diffrax Kvaerno3"))
+    fit = json.loads((ROOT / "experiments/identification/silverbox.json").read_text())["models"]["10 parameters"]
+    told = re.search(r"in ([\d.]+) s \(([\d.]+) s\nwith compiling\)", README).groups()
+    assert told == (f"{fit['fit_time_s']:.2f}", f"{fit['fit_with_compilation_s']:.1f}")
+
+
 def test_it_is_short():
     assert len(README.splitlines()) <= 150
 
