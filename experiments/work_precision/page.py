@@ -10,6 +10,7 @@ from experiments.page import busy, table
 from experiments.work_precision.figures import PACKAGES, gradient_figures
 from experiments.work_precision.gradients import SCENES
 from experiments.work_precision.timing import FINEST
+from experiments.work_precision.tree import draw_tree
 
 HERE = Path(__file__).parent
 STIFF = "stiff double pendulum"
@@ -201,4 +202,6 @@ def page(numbers):
 
 
 if __name__ == "__main__":
-    (HERE / "README.md").write_text(page(json.loads((HERE / "work_precision.json").read_text())))
+    found = json.loads((HERE / "work_precision.json").read_text())
+    (HERE / "README.md").write_text(page(found))
+    draw_tree(found["times"], HERE / "work_precision_tree.png")
