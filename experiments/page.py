@@ -16,4 +16,8 @@ def find(entries, **keys):
 def busy(machine):
     """A warning where others kept the machine busy while its times were taken."""
     load = machine["load_at_start"]
-    return ", so that all times are too long and ratios rough" if load and load > machine["cores"] / 2 else ""
+    return (
+        " (other programs ran: all times are too long, and ratios are rough)"
+        if load and load > machine["cores"] / 2
+        else ""
+    )

@@ -24,19 +24,19 @@ def rows_table(rows, columns):
 
 
 def bars(numbers):
-    """What was aimed at and what was found: (what, bar, found, met)."""
+    """What was aimed at and what was found: (quantity, target, measured, met)."""
     c, stiff = numbers["against_c"], numbers["against_c"]["stiff_ns_per_step"]
     single = {(r["trigonometry"], r["saved"]): r for r in c["single"] if r["method"] == PREDICTOR}
     gradient = find(numbers["gradients"]["long"], steps=100_000, saved="path")
     found = []
     if c["c_ns_per_step"]:
         found += [
-            ("one trajectory, predictor, end saved, over C", 1.1, single["jnp", "end"]["over_c"]),
-            ("one trajectory, auto, over C", 1.5, find(c["single"], method=AUTO, trigonometry="jnp")["over_c"]),
+            ("time over C: one trajectory, predictor, end saved", 1.1, single["jnp", "end"]["over_c"]),
+            ("time over C: one trajectory, auto", 1.5, find(c["single"], method=AUTO, trigonometry="jnp")["over_c"]),
         ]
         found += [
             (
-                f"batch of 256, {method.split()[-1]}, {where}, over C",
+                f"time over C: batch of 256, {method.split()[-1]}, {where}",
                 limit,
                 find(c["batch"], method=method, trigonometry="jnp", vectors_bits=bits)["over_c"],
             )
@@ -45,30 +45,32 @@ def bars(numbers):
         ]
     for name in ("polynomial", "jnp"):
         ratio = single[name, "path"]["ns_per_step"] / single[name, "end"]["ns_per_step"]
-        found.append((f"every step saved over the end only, {name}", 1.3, ratio))
+        found.append((f"time, all steps saved over only the end, {name} sines", 1.3, ratio))
     found += [
-        ("value and gradient over value, 4 parameters, 1e5 steps, path", 4.0, gradient["gradient_over_forward"]),
-        ("its temporary memory, MB", 5.0, gradient["gradient_temporary_bytes"] / 1e6),
+        ("time, value and gradient over value (4 parameters, 1e5 steps, path)", 4.0, gradient["gradient_over_forward"]),
+        ("temporary memory of that gradient, MB", 5.0, gradient["gradient_temporary_bytes"] / 1e6),
     ]
     for r in numbers["compile_time"]["rows"]:
         if r["method"] == "hht, auto" and r["over_kvaerno3"] is not None:
             limit = 0.5 if r["compiled"] == "run" else 1.0
-            found.append((f"compile time of a {r['compiled']} over diffrax Kvaerno3", limit, r["over_kvaerno3"]))
+            found.append(
+                (f"compile time of a {r['compiled']} over that of diffrax Kvaerno3", limit, r["over_kvaerno3"])
+            )
     at_least = [
-        ("converged over non-iterative, stiff joints, predictor, jnp.sin", 2.0, stiff[CONVERGED] / stiff[PREDICTOR]),
-        ("the same, auto", 2.0, stiff[CONVERGED] / stiff[AUTO]),
+        ("time, converged over predictor (stiff joints, jnp sines)", 2.0, stiff[CONVERGED] / stiff[PREDICTOR]),
+        ("time, converged over auto (stiff joints, jnp sines)", 2.0, stiff[CONVERGED] / stiff[AUTO]),
     ]
     fast = {
         r["method"]: r["ns_per_step"] for r in c["single"] if (r["trigonometry"], r["saved"]) == ("polynomial", "end")
     }
     ratio = fast[CONVERGED] / fast[PREDICTOR]
-    at_least.append(("converged over non-iterative, free joints, predictor, polynomial sines", 2.0, ratio))
+    at_least.append(("time, converged over predictor (free joints, polynomial sines)", 2.0, ratio))
     for N, limit in ((8, 8.0), (16, 9.0), (64, 30.0)):
         mine = [r["faster_than_obvious_N2"] for r in numbers["chains"]["rows"] if r["N"] == N and r["step"] == "ours"]
-        at_least.append((f"obvious step over ours, chain of {N}", limit, max(mine)))
+        at_least.append((f"time, plain JAX over ours, chain of {N}", limit, max(mine)))
     lines = [[what, f"<= {limit:g}", f"{x:.2f}", "yes" if x <= limit else "no"] for what, limit, x in found]
     lines += [[what, f">= {limit:g}", f"{x:.2f}", "yes" if x >= limit else "no"] for what, limit, x in at_least]
-    return table(["what", "bar", "here", "met"], lines)
+    return table(["quantity", "target", "measured", "met"], lines)
 
 
 def first_call_rows(numbers, before):
@@ -93,8 +95,8 @@ def halves(rows):
     bounded = [r for r in more if r.get("plain over before", 0) > 0.5]
     left = ", ".join(f"{r['scene']} ({r['call']})" for r in more if r not in bounded) or "none"
     return (
-        f"Half of before, or less: {len(rows) - len(more)} of {len(rows)}. Of the others plain JAX, too, takes more "
-        f"than half of before in {len(bounded)}; not in: {left}."
+        f"{len(rows) - len(more)} of {len(rows)} first calls take at most half of the total before. In {len(bounded)} "
+        f"of the others plain JAX also takes more than half. The rest: {left}."
     )
 
 
@@ -102,13 +104,13 @@ def first_call(rows):
     """The table of these."""
     columns = "scene", "call", "before", "total", "over before", "plain JAX", "plain over before", "tracing"
     columns = *columns, "lowering", "compiling", "with a cache", "share", "plain's share"
-    return rows_table(rows, {name: name for name in columns})
+    return rows_table(rows, {"cached" if name == "with a cache" else name: name for name in columns})
 
 
 def calls(numbers):
     """What a call costs beside its steps, if that was ever measured: `--parts calls`."""
     if numbers is None:
-        return "Nothing was measured: `python -m experiments benchmarks --parts calls` does."
+        return "Not measured in this run. To measure: `python -m experiments benchmarks --parts calls`."
     rows = [{**r["us"], **r} for r in numbers["rows"]]
     ratios = [key for key in rows[0] if key.endswith("ratio")]
     times = {f"{way} (us)": way for way in numbers["rows"][0]["us"]}
@@ -134,16 +136,16 @@ def accelerator(numbers):
     """What `--gpu` measured, if it was ever run."""
     if numbers is None:
         return (
-            "Nothing was measured: no accelerator was at hand. `python -m experiments benchmarks --gpu` measures, on "
-            "one that JAX finds, `vmap` of a run of the double pendulum up to a million members, diffrax's beside it, "
-            "and 8.4 million Lorenz systems in single precision. Nothing of the library is made for accelerators: it "
-            "runs there as plain JAX does."
+            "Not measured: this machine has no accelerator. On a machine with one, `python -m experiments benchmarks "
+            "--gpu` measures `vmap` of a run of the double pendulum with up to a million members, diffrax's beside it, "
+            "and 8.4 million Lorenz systems in single precision. Nothing in the library is made for accelerators; it "
+            "runs there as plain JAX."
         )
     rows = [{"members": f"{r['members']}", **r["ns_per_step_and_member"]} for r in numbers["pendulums"]]
     lorenz = numbers["lorenz"]
     published = ", ".join(f"{name}: {x} ms" for name, x in lorenz["published_ms"].items())
     return (
-        f"{numbers['device']}, jax {numbers['jax']}; double pendulums in float64, ns per step and member:\n\n"
+        f"{numbers['device']}, jax {numbers['jax']}; double pendulums in float64, warm, ns per step and member:\n\n"
         f"{rows_table(rows, {key: key for row in rows for key in row})}\n\n"
         f"{lorenz['members']} Lorenz systems, {lorenz['num_steps']} steps of `rk4` in float32: "
         f"{lorenz['time_ms']:.3g} ms (published: {published})."
@@ -171,6 +173,11 @@ def page(numbers):
                 f"`XLA_FLAGS={machine['XLA_FLAGS']}`."
             ),
             bars=bars(numbers),
+            single_over_c=find(c["single"], method=PREDICTOR, trigonometry="jnp", saved="end")["over_c"],
+            batch_over_c=find(c["batch"], method=PREDICTOR, trigonometry="jnp", vectors_bits=512)["over_c"],
+            gradient_over=find(gradients["long"], steps=100_000, saved="path")["gradient_over_forward"],
+            first_least=min(r["total"] for r in firsts if r["call"] == "simulate"),
+            first_most=max(r["total"] for r in firsts if r["call"] == "simulate"),
             difference=number(max(differences, default=None)),
             steps=c["num_steps"],
             single=rows_table(
@@ -204,7 +211,7 @@ def page(numbers):
                     "structure": "structure",
                     "N": "N",
                     "us per step": "us_per_step",
-                    "without": "without_us_per_step",
+                    "without (us)": "without_us_per_step",
                     "ratio": "time_over_without",
                 },
             ),
@@ -215,7 +222,7 @@ def page(numbers):
             over=", ".join(f"{name} {x:.0f}" for name, x in batches["over"].items()),
             long=rows_table(
                 [{**r, "MB": r["gradient_temporary_bytes"] / 1e6, "steps": f"{r['steps']}"} for r in gradients["long"]],
-                {"steps": "steps", "saved": "saved", "time over value's": "gradient_over_forward", "MB": "MB"},
+                {"steps": "steps", "saved": "saved", "ratio": "gradient_over_forward", "MB": "MB"},
             ),
             num_steps=gradients["num_steps"],
             gradients=rows_table(
@@ -229,21 +236,21 @@ def page(numbers):
                 },
             ),
             chains=rows_table(
-                numbers["chains"]["rows"],
+                [{**r, "step": r["step"].replace("obvious", "plain JAX")} for r in numbers["chains"]["rows"]],
                 {
                     "N": "N",
                     "step": "step",
                     "formulation": "formulation",
                     "us per step": "us_per_step",
-                    "obvious / this, same formulation": "faster_than_obvious_same_functions",
-                    "obvious on N^2 sines / this": "faster_than_obvious_N2",
+                    "plain, same sines / this": "faster_than_obvious_same_functions",
+                    "plain, N^2 sines / this": "faster_than_obvious_N2",
                 },
             ),
             compile_steps=numbers["compile_time"]["num_steps"],
-            not_installed=f"Not installed where this was made: {', '.join(missing)}." if missing else "",
+            not_installed=f"Not installed on this machine: {', '.join(missing)}." if missing else "",
             compile=rows_table(
                 numbers["compile_time"]["rows"],
-                {"method": "method", "of": "compiled", "s": "compile_s", "over Kvaerno3's": "over_kvaerno3"},
+                {"method": "method", "program": "compiled", "s": "compile_s", "over Kvaerno3": "over_kvaerno3"},
             ),
             first_steps=numbers["first_call"]["num_steps"],
             first_call=first_call(firsts),

@@ -27,12 +27,12 @@ def bars_table(numbers):
     slowest = max(row["c_time_over_xla"] for row in speed["scenes"])
     rows = [
         [
-            f"C and Python after {fitted['num_steps']} steps (rad)",
+            f"difference of C and Python after {fitted['num_steps']} steps (rad)",
             "<= 1e-12",
             *verdict(fitted["difference_rad"], 1e-12),
         ],
-        ["a step over C written by hand", "<= 1.1", *verdict(speed["time_over_by_hand"], 1.1)],
-        ["a step over XLA's kernel, worst scene", "<= 1.5", *verdict(slowest, 1.5)],
+        ["time of a step over C written by hand", "<= 1.1", *verdict(speed["time_over_by_hand"], 1.1)],
+        ["time of a step over XLA, worst scene", "<= 1.5", *verdict(slowest, 1.5)],
     ]
     for rate, chance in numbers["real_time"]["chance_of_not_explained"].items():
         own, waits = (
@@ -41,13 +41,13 @@ def bars_table(numbers):
         )
         rows.append(
             [
-                f"deadlines missed at {rate} that nothing explains",
-                f"as many as of a loop that waits, {waits}, but by a chance of 5 %",
-                f"{own}, a chance of {100 * chance:.0f} %",
+                f"unexplained missed deadlines at {rate}",
+                f"as the waiting loop ({waits}); chance >= 5 %",
+                f"{own}; chance {100 * chance:.0f} %",
                 yes_or_no(chance >= 0.05),
             ]
         )
-    return table(["what", "bar", "measured", "holds"], rows)
+    return table(["quantity", "target", "measured", "met"], rows)
 
 
 def deadlines_table(rows):
@@ -73,9 +73,17 @@ def page(numbers):
         .read_text()
         .format(
             machine=(
-                f"On {machine['processor']}, {machine['cores']} cores, with a load of {machine['load_at_start']:.1f}"
-                f"{busy(machine)}; jax {machine['jax']}, {machine['compiler']}. All of it is in float64."
+                f"{machine['processor']}, {machine['cores']} cores, with a load of {machine['load_at_start']:.1f}"
+                f"{busy(machine)}; jax {machine['jax']}, {machine['compiler']}. Everything is in float64."
             ),
+            deadline_words=" ".join(
+                f"At {r['rate']} the step misses {r['missed_count']} of {r['calls']} deadlines; "
+                f"{r['not_explained_count']} of these are unexplained."
+                for r in real["deadlines"]
+                if r["form"] == "step"
+            ),
+            over_hand=speed["time_over_by_hand"],
+            over_xla=max(row["c_time_over_xla"] for row in speed["scenes"]),
             bars=bars_table(numbers),
             samples=2 * fitted["num_samples"],
             noise=1e3 * fitted["noise_rad"],
@@ -90,7 +98,7 @@ def page(numbers):
             flags=f"`{speed['flags']}`",
             by_hand=table(["form", "ns per step"], [[k, f"{x:.1f}"] for k, x in speed["by_hand_ns"].items()]),
             scenes=table(
-                ["scene", "operations", "sines and the like", "C (ns)", "XLA (ns)", "C over XLA", "difference"],
+                ["scene", "operations", "sines etc.", "C (ns)", "XLA (ns)", "C over XLA", "difference"],
                 [
                     [r["scene"], r["operations"], r["functions"], f"{r['c_ns']:.0f}", f"{r['xla_ns']:.0f}",
                      f"{r['c_time_over_xla']:.2f}", f"{r['relative_difference']:.0e}"]
@@ -98,9 +106,9 @@ def page(numbers):
                 ],
             ),
             policy=(
-                "They run with real-time scheduling (`SCHED_FIFO`) and locked memory; Python does not."
+                "The loops run with real-time scheduling (`SCHED_FIFO`) and locked memory; Python does not."
                 if real["real_time_scheduling"]
-                else "The operating system gave them no real-time scheduling."
+                else "The operating system gave the loops no real-time scheduling."
             ),
             deadlines=deadlines_table(real["deadlines"]),
             real_load=real["load_at_start"],

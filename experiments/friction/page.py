@@ -30,9 +30,18 @@ def page(numbers):
             switches=numbers["switches"],
             samples=numbers["samples"],
             most=max(row["steps"] for row in numbers["rows"]),
-            saved=table(["error (m)", "steps, set-valued", "tanh takes times as many", "MuJoCo", "exudyn"], saved),
+            saved=table(
+                ["error (m)", "steps, set-valued", "tanh / set-valued", "MuJoCo / set-valued", "exudyn / set-valued"],
+                saved,
+            ),
+            first_error=saved[0][0],
+            first_steps=saved[0][1],
+            first_tanh=saved[0][2],
+            last_error=saved[-1][0],
+            last_tanh=saved[-1][2],
+            worst_creep=f"{max(abs(q[-1]) for q in numbers['creep']['q_m'].values()):.2g}",
             duration=numbers["creep"]["t_s"][-1],
-            creep=table(["", "m"], creep),
+            creep=table(["law", "movement (m)"], creep),
         )
     )
 

@@ -120,7 +120,7 @@ def emps_pieces(numbers):
     ]  # fmt: skip
     chosen, other = numbers["models"][numbers["chosen"]], numbers["other_friction"]
     before, after = numbers["force_regression"]["train"], numbers["force_regression"]["test"]
-    header = ["model", "parameters", "training", "left out", "standard errors behind", "test"]
+    header = ["model", "parameters", "training", "left out", "behind the best (standard errors)", "test"]
     return {
         "emps_models": table(header, models),
         "emps_chosen": numbers["chosen"],
@@ -174,7 +174,7 @@ def tanks_pieces(numbers):
         for (name, unit), value in ((key.split("_in_"), x) for key, x in numbers["estimates"].items())
     ]
     return {
-        "tanks": table(["added, one after the other", "parameters", "training", "left out of it", "test"], rows),
+        "tanks": table(["term added", "parameters", "training", "left out", "test"], rows),
         "tanks_estimates": table(["", "estimate", "95 % interval", "unit"], estimates),
         "tanks_chosen": numbers["chosen"],
         "tanks_test": numbers["test_V"],
@@ -224,12 +224,17 @@ def page(numbers):
             stiff_converged=stiff["converged"],
             stiff_cost=stiff["largest_cost_per_residual"],
             stiff_seconds=stiff["fit_time_s"],
+            stiff_cold=stiff["fit_with_compilation_s"],
+            stiff_covered=stiff["covered"]["Richardson"]["k1"],
+            stiff_covered_h=stiff["covered"]["h"]["k1"],
+            arrow_mV=numbers["silverbox"]["models"]["10 parameters"]["arrow_full_mV"],
+            machine="{processor}, {cores} cores, jax {jax}".format(**numbers["stiff_joint"]["made_by"]),
             stiff_k2=stiff["determined"]["k2"],
             stiff=covered(stiff),
             gradients=gradients_table(gradients),
             diffrax=f"diffrax's Kvaerno5 with a tolerance of 1e-6 and its default adjoint takes "
-            f"{1e3 * theirs['seconds']:.0f} ms for {theirs['relative_error']:.1e}; the non-iterative step "
-            f"{1e3 * ours['seconds']:.1f} ms for {ours['relative_error']:.1e}.",
+            f"{1e3 * theirs['seconds']:.0f} ms for an error of {theirs['relative_error']:.1e}. The non-iterative step "
+            f"takes {1e3 * ours['seconds']:.1f} ms for {ours['relative_error']:.1e}. Both times are warm.",
             vehicle_noise=vehicle["noise"],
             vehicle_records=vehicle["records"],
             vehicle=covered(vehicle),

@@ -36,9 +36,12 @@ def page(numbers):
         (HERE / "page.md")
         .read_text()
         .format(
-            cases=table(["what", "right", "before", "now"], rows),
+            problems=len(rows),
+            worst_before=f"{max(x for kind in kinds for x in light_errors(before['starts'], kind)):.0e} F/k",
+            worst_now=f"{max(x for by_name in numbers['worst_error'].values() for x in by_name.values()):.0e} F/k",
+            cases=table(["problem", "right answer", "before", "now"], rows),
             worst=table(["before -> now", *kinds], worst),
-            order=table(["", *(f"m = {m} kg" for m in masses)], order),
+            order=table(["method", *(f"m = {m} kg" for m in masses)], order),
         )
     )
 
@@ -47,6 +50,11 @@ def of_light(told, kind, name):
     """The largest error of a stepper for light masses."""
     errors = told["error_over_F_by_k"][kind].get(name)
     return None if errors is None else max(x for x, m in zip(errors, told["m_kg"], strict=True) if m <= LIGHT)
+
+
+def light_errors(told, kind):
+    """The largest errors of all steppers for light masses."""
+    return [of_light(told, kind, name) for name in told["error_over_F_by_k"][kind]]
 
 
 def both(before, now):

@@ -43,7 +43,7 @@ def tables_of(cases) -> str:
             if x["time_s"][0] is not None
         ]
         parts += [f"**{case['case']}**, n = {case['n']}, {case['duration_s']:g} s", ""]
-        parts += [table(["", *(f"{target:.0e} rad" for target in TARGETS)], rows), ""]
+        parts += [table(["method", *(f"{target:.0e} rad" for target in TARGETS)], rows), ""]
     return "\n".join(parts).strip()
 
 
@@ -67,7 +67,7 @@ def rigid(cases) -> str:
             cells = [(at_step(x, key), largest(x, 1e-4, key)) for key in ("error_rad", "late_error_rad")]
             rows.append([short(case), name, *(y for pair in cells for y in pair)])
     late = f"from {LATE:g} s on"
-    header = ["", "", "error at 20 ms", "1e-4 up to (ms)", f"{late}, at 20 ms", f"{late}, 1e-4 up to (ms)"]
+    header = ["case", "method", "error at 20 ms", "1e-4 up to (ms)", f"error {late}", f"1e-4 {late} up to (ms)"]
     return table(header, rows)
 
 
@@ -78,8 +78,8 @@ def verdicts(cases, key: str, aim: float) -> str:
         rows = case["methods"]["hht"]
         value = rows[key][rows["h_s"].index(STEP)]
         met = value is not None and value <= aim
-        lines.append(f"{short(case)}: {'reached' if met else 'missed'}")
-    return f"With the default that was: {'; '.join(lines)}."
+        lines.append(f"{'reached' if met else 'missed'} with {short(case)}")
+    return f"With the default `hht()` it is {'; '.join(lines)}."
 
 
 def short(case) -> str:
@@ -95,7 +95,8 @@ def flexible(cases) -> str:
             torques = [percent(x[key][x["h_s"].index(STEP)]) for key in ("torque_error", "late_torque_error")]
             steps = [largest(x, 0.01, key) for key in ("torque_error", "late_torque_error")]
             rows.append([short(case), name, *torques, *steps])
-    header = ["", "", "error at 20 ms", f"from {LATE:g} s on", "1 % up to (ms)", f"from {LATE:g} s on (ms)"]
+    late = f"from {LATE:g} s on"
+    header = ["case", "method", "error at 20 ms", f"error {late}", "1 % up to (ms)", f"1 % {late} up to (ms)"]
     return table(header, rows)
 
 
@@ -111,7 +112,7 @@ def step_times(found: dict) -> str:
     for case, values in found.items():
         cells = [f"{values[m]['us']:.3g}" + bracket(values[m]) for m in methods]
         rows.append([case, *cells])
-    return table(["us", *(m if m == "hht" else f"MuJoCo {m}" for m in methods)], rows)
+    return table(["case, us", *(m if m == "hht" else f"MuJoCo {m}" for m in methods)], rows)
 
 
 def bracket(values: dict) -> str:
@@ -135,7 +136,7 @@ def row_of_loops(found: dict) -> str:
     if found["mujoco_us_a_step"] is not None:
         name = "MuJoCo implicitfast, soft loops"
         rows.append([name, f"{found['mujoco_us_a_step']:.0f}", "", f"{found['mujoco_error_rad']:.1e}", ""])
-    return table(["", "us a step", "first call, CPU s", "error (rad)", "largest gap (m)"], rows)
+    return table(["model", "us per step", "first call (CPU s)", "error (rad)", "largest gap (m)"], rows)
 
 
 def humanoids(found: dict) -> str:
@@ -150,20 +151,32 @@ def humanoids(found: dict) -> str:
         for name, x in found["models"].items()
     ]  # fmt: skip
     words = (
-        f"Models of dm_control {found['dm_control']}, which fall without contact, motors, dry friction and ranges, in "
-        "both programs. Steps of 2 ms."
+        f"Models of dm_control {found['dm_control']} fall in steps of 2 ms, without contact, motors, dry friction and "
+        "joint ranges in both programs. Step times are warm, first calls cold."
     )
     header = [
-        "",
-        "rates",
-        "us a step",
-        "CPU us a step",
-        "MuJoCo implicitfast, us",
+        "model",
+        "velocities",
+        "us per step",
+        "CPU us per step",
+        "MuJoCo implicitfast (us)",
         "ratio",
-        "first call, CPU s",
+        "first call (CPU s)",
         "finite",
     ]
     return f"{words}\n\n{table(header, rows)}"
+
+
+def fastest(case, method: str) -> str:
+    """The least time to 1e-4 rad of the methods that begin so, ms."""
+    found = (reached(usable(x), 1e-4) for name, x in case["methods"].items() if name.startswith(method))
+    return milliseconds(min((x["time_s"] for x in found if x and x["time_s"] is not None), default=None))
+
+
+def humanoid_ratio(found: dict) -> str:
+    """Of our steps to MuJoCo's, from the least to the largest."""
+    ratios = [x["us_a_step"] / x["mujoco_us_a_step"] for x in found.get("models", {}).values()]
+    return f"{min(ratios):.0f} to {max(ratios):.0f}" if ratios else "(not measured)"
 
 
 def page(numbers):
@@ -185,6 +198,11 @@ def page(numbers):
         .read_text()
         .format(
             machine=numbers["machine"],
+            arm_hht=fastest(arms[0], "hht"),
+            arm_mujoco=fastest(arms[0], "MuJoCo"),
+            chain_hht=fastest(cases[-1], "hht"),
+            chain_mujoco=fastest(cases[-1], "MuJoCo"),
+            humanoid_ratio=humanoid_ratio(numbers["humanoids"]),
             load=made_by["load_at_end"],
             versions=versions + "".join(f" {name} was not installed." for name in missing),
             same=SAME,

@@ -29,17 +29,17 @@ def advice_table(summary):
         [f"{100 * float(limit):g} %", e["cases"], e["within_1.5"], f"{e['least']:.2f} ... {e['largest']:.2f}"]
         for limit, e in summary.items()
     ]
-    return table(["error", "cases", "within a factor 1.5", "advised over measured"], rows)
+    return table(["error", "cases", "within a factor 1.5", "suggested / measured"], rows)
 
 
 def misses(entries):
     """The cases beyond a factor of 1.5, in words."""
     found = []
     for e in entries:
-        ratio = "none advised" if e["advised_over_measured"] is None else f"{e['advised_over_measured']:.2f}"
+        ratio = "none suggested" if e["advised_over_measured"] is None else f"{e['advised_over_measured']:.2f}"
         alpha = "" if e["alpha"] is None else f", alpha = {e['alpha']:g}"
         found.append(f"* {e['scene']}, {e['method']}{alpha}, {100 * float(e['limit']):g} %: {ratio}")
-    return "\n".join(["Beyond that factor:\n", *found]) if found else "None is beyond that factor."
+    return "\n".join(["Beyond a factor of 1.5:\n", *found]) if found else "No case is beyond a factor of 1.5."
 
 
 def exceptions(entries):
@@ -161,7 +161,7 @@ def drift_table(entries):
 
 def dampers_table(rows):
     """Steps and differences."""
-    header = ["c (N m s/rad)", "steps of hht", "its difference (rad)", "steps of Tsit5", "its difference (rad)"]
+    header = ["c (N m s/rad)", "steps of hht", "difference (rad)", "steps of Tsit5", "difference (rad)"]
     cells = []
     for row in rows:
         peer = ["-", "-"]
@@ -219,7 +219,7 @@ def page(numbers):
             adaptive_now=alone["A"],
             adaptive_verified=verified["A"] + verified["n"],
             adaptive_wrong=adaptive["cells"]["no"]["silently_wrong"],
-            adaptive_scenes=f"all of them of: {', '.join(drifting)}",
+            adaptive_scenes=f"all on: {', '.join(drifting)}",
             controller=controller_table(controller),
             controller_tuned="; ".join(controller["tuned"]["scenes"]),
             controller_held="; ".join(controller["held_out"]["scenes"]),
@@ -255,7 +255,7 @@ def page(numbers):
             drift_steps=drift["num_steps"],
             drift_alpha=drift["alpha"],
             drift=drift_table(drift["entries"]),
-            not_installed=f"Not installed where this was made: {', '.join(missing)}. " if missing else "",
+            not_installed=f"Not installed on this machine: {', '.join(missing)}. " if missing else "",
             omega_max=peers["omega_h"][-1],
             springs=table(
                 ["method", "largest omega h"],

@@ -54,7 +54,7 @@ def bars(entries):
         default = next(e["time_s"][level] for e in entries if e["method"] == "hht")
         ratios = ["-" if t is None or theirs is None else f"{theirs / t:.1f}" for t in (ours, default)]
         rows.append([level, f"{peer}: {ms(theirs)} ms", f"{method}: {ms(ours)} ms", *ratios, f">= {bar}"])
-    return table(["error", "best peer", "best of ours", "ratio", "over the default `hht()`", "bar"], rows)
+    return table(["error", "fastest of these", "our fastest", "ratio", "ratio to `hht()`", "target ratio"], rows)
 
 
 def losses(times, default=None):
@@ -68,19 +68,17 @@ def losses(times, default=None):
             if theirs is None:
                 continue
             if ours is None or theirs < ours:
-                times_faster = "none of ours gets there" if ours is None else f"{ours / theirs:.1f} times as fast"
+                times_faster = "none of ours reaches it" if ours is None else f"{ours / theirs:.1f} times as fast"
                 lost.append(f"{level} ({peer}: {times_faster})")
             elif default and (usual is None or theirs < usual):
                 times_faster = (
-                    f"{default} does not get there" if usual is None else f"{usual / theirs:.1f} times as fast"
+                    f"{default} does not reach it" if usual is None else f"{usual / theirs:.1f} times as fast"
                 )
                 default_lost.append(f"{level} ({peer}: {times_faster})")
         if lost:
-            lines.append(f"* {name}: all of ours lose at {', '.join(lost)}.")
+            lines.append(f"* {name}: all our methods lose at {', '.join(lost)}.")
         if default_lost:
-            lines.append(
-                f"* {name}: the default `{default}()` loses, others of ours do not, at {', '.join(default_lost)}."
-            )
+            lines.append(f"* {name}: only the default `{default}()` loses, at {', '.join(default_lost)}.")
     return "\n".join(lines) or "Nowhere, in these runs."
 
 
@@ -96,7 +94,20 @@ def who_wins(times):
         counts = {package: fastest.count(package) for package in PACKAGES if package in fastest}
         told = ", ".join(f"{package} {n}" for package, n in sorted(counts.items(), key=lambda x: -x[1]))
         rows.append([level, told or "-"])
-    return table(["error", "scenes on which each is the fastest"], rows)
+    return table(["error", "scenes on which each package is the fastest"], rows)
+
+
+def answer(times):
+    """On how many scenes ours is the fastest, at three errors, and who is where it is not."""
+    counts = []
+    for level in ("0.001", "1e-06", "1e-10"):
+        found = [best(entries, level) for entries in times.values() if level in entries[0]["time_s"]]
+        ours = [best(entries, level, PACKAGES[:1]) for entries in times.values() if level in entries[0]["time_s"]]
+        counts.append(f"{sum(a[0] is not None and a == b for a, b in zip(found, ours, strict=True))} at {level}")
+    return (
+        f"Of {len(times)} scenes ours is the fastest package on {', '.join(counts)}. Elsewhere heyoka's Taylor series "
+        f"or numbalsoda's compiled solvers are faster."
+    )
 
 
 def calls(numbers):
@@ -105,7 +116,7 @@ def calls(numbers):
     if found is None:
         return "A call: not measured in this run."
     told = ", ".join(f"`{kind}` {1e6 * t:.0f} us" for kind, t in found.items())
-    return f"A call that takes one step of `hht()` on the stiff double pendulum: {told}."
+    return f"A warm call for one step of `hht()` on the stiff double pendulum takes: {told}."
 
 
 def batches(numbers):
@@ -115,7 +126,8 @@ def batches(numbers):
         return "Not measured in this run."
     text = (
         f"{found['members']} members, each with its own parameters (those of the gradients, times factors of "
-        f"{1 - found['spread']:g} to {1 + found['spread']:g}), on {found['cores']} cores. Time in ms to an error:"
+        f"{1 - found['spread']:g} to {1 + found['spread']:g}), on {found['cores']} cores. Warm time in ms to reach an "
+        f"error:"
     )
     tables = [times_table(entries, name) for name, entries in found["times"].items()]
     return "\n\n".join([text, *tables, losses(found["times"])])
@@ -149,7 +161,7 @@ def choices(numbers):
                 ratio,
             ]
         )
-    return table(["scene", "error", "stiffness", "chosen", "its error", "ms", "best of ours", "ratio"], rows)
+    return table(["scene", "error", "stiffness", "chosen", "its error", "ms", "our fastest (ms)", "ratio"], rows)
 
 
 def parameters(names):
@@ -178,7 +190,7 @@ def page(numbers):
                 f"{machine['python']}; {machine['compiler'] or 'no C compiler'}; load at the start "
                 f"{machine['load_at_start']:.1f}{busy(machine)}; `XLA_FLAGS={machine['XLA_FLAGS']}`."
             ),
-            missing=f"Not installed where this was made, and left out: {', '.join(missing)}." if missing else "",
+            missing=f"Not installed on this machine, so left out: {', '.join(missing)}." if missing else "",
             samples=SAMPLES,
             longest=numbers["longest_s"],
             finest=FINEST,
@@ -186,11 +198,16 @@ def page(numbers):
             bars=bars(times[STIFF]),
             losses=losses(times, "hht"),
             wins=who_wins(times),
+            answer=answer(times),
+            packages=sum(any(e["package"] == p for x in times.values() for e in x) for p in PACKAGES),
             calls=calls(numbers),
+            call_us=1e6 * numbers["calls_s"]["jit(simulate)"],
+            empty_us=1e6 * numbers["calls_s"]["jit of nothing"],
             batches=batches(numbers),
             choices=choices(numbers),
             gradient_figures="\n\n".join(
-                f"![Error of the gradient against time]({name}.png)" for name in gradient_figures(list(gradients))
+                f"![Relative error of the gradient against time of value and gradient]({name}.png)"
+                for name in gradient_figures(list(gradients))
             ),
             parameters=parameters(gradients),
             gradient_losses=losses(gradients),
