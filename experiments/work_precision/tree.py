@@ -4,7 +4,7 @@ import hhtjax
 
 STIFF, SMOOTH, MECHANISM = "stiff double pendulum", "free double pendulum", "squeezer"
 
-# (question, answer if yes, answer if no); an answer is a question, or a leaf: method, its name in the JSON, error, scene
+# (question, if yes, if no): answers are questions, or leaves (method, its name in the JSON, error, scene)
 TREE = (
     "contact or\ndry friction?",
     ("hht(), equal steps", None, "", ""),
