@@ -1,11 +1,11 @@
 # %% [markdown]
 # # 9. Grey box: known physics, and a network for the rest
 #
-# Often most of a model is known, and one part is not: friction in a guide, a rubber bushing,
-# a seal. Then let the known part be physics, and put a small neural network in the place of
-# the unknown one. It is a function inside `force`, its weights are parameters like any other,
-# and `fit` finds them through the simulation. No friction force needs to be measured, nor a
-# velocity: a record of force and position is enough.
+# Often most of a model is known and one part is not: friction in a guide, a rubber bushing, a
+# seal. Then use physics for the known part and a small neural network for the unknown part.
+# The network is a function inside `force`. Its weights are parameters like any other, and
+# `fit` finds them through the simulation. You need no measurement of the friction force or of
+# the velocity: a record of force and position is enough.
 
 # %%
 import time
@@ -23,12 +23,12 @@ jax.config.update("jax_enable_x64", True)  # double precision; JAX starts in sin
 # %% [markdown]
 # ## The record
 #
-# A slider of 1 kg on a spring, with friction in its guide:
-# $m\ddot q + kq + f(\dot q) = u(t)$. The record is generated, so that we can compare with the
-# truth in the end: friction falls first when sliding begins and then rises with speed
-# (Stribeck's curve). Two records of 3 s, with different random forces up to 5 Hz: one to
-# train on, one to test. Positions have white noise of 0.2 mm. To generate them we take steps
-# 8 times smaller than the model's.
+# A slider of 1 kg on a spring has friction in its guide: $m\ddot q + kq + f(\dot q) = u(t)$.
+# The record is generated, so that we can compare with the true friction at the end. Friction
+# first falls when sliding begins, and then rises with speed (Stribeck's curve). There are two
+# records of 3 s with different random forces up to 5 Hz: one for training, one for the test.
+# Positions have white noise of 0.2 mm. The records use steps 8 times smaller than the
+# model's.
 
 # %%
 DT, N, NOISE = 1e-3, 3000, 2e-4  # s, samples, m
@@ -77,7 +77,7 @@ print(
 # %% [markdown]
 # ## Physics alone
 #
-# First what most would try: a linear damper. The misfit is given in units of the noise: a
+# First we try what most would try: a linear damper. The misfit is in units of the noise, so a
 # perfect model has 1.
 
 
@@ -100,17 +100,17 @@ print(f"misfit {rms(physics.residual):.1f} times the noise")
 # %% [markdown]
 # ## The network in the force
 #
-# A damper as before, and a network with one hidden layer of 8. What we know of friction is
-# built in:
+# The force has a damper as before, and a network with one hidden layer of 8. Two things are
+# known about friction, and we build them in:
 #
-# * it depends on velocity only, and is **odd**: $f(-v) = -f(v)$, so we take $g(v) - g(-v)$;
-# * it changes fast at low speeds and slowly at high ones: so the input is
-#   $\operatorname{arsinh}(v/v_0)$, which is linear below $v_0$ = 0.05 m/s, and a logarithm
+# * It depends only on velocity and is **odd**: $f(-v) = -f(v)$. So we take $g(v) - g(-v)$.
+# * It changes fast at low speeds and slowly at high speeds. So the input is
+#   $\operatorname{arsinh}(v/v_0)$. This is linear below $v_0$ = 0.05 m/s, and a logarithm
 #   above.
 #
-# An `equinox` module is a pytree: it goes into `params` as it is, beside the stiffness.
-# Damper and network can do the work of each other, so `c` alone means nothing now, only their
-# sum does; `k` is fitted with them and still means what it says.
+# An `equinox` module is a pytree. It goes into `params` unchanged, beside the stiffness.
+# Damper and network can replace each other, so `c` alone has no meaning now; only their sum
+# has. `k` is fitted with them and keeps its meaning.
 
 # %%
 net = eqx.nn.MLP(
@@ -150,13 +150,15 @@ assert rms(found.residual) < 1.1
 assert abs(found.params["k"] - 400) < abs(physics.params["k"] - 400)
 
 # %% [markdown]
-# `fit` took Levenberg-Marquardt, its default up to 64 parameters: the derivatives of all
-# samples with respect to all weights, through the non-iterative step. For larger networks
-# pass an optax optimiser, such as `fit(residuals, start, optax.adam(1e-2))`, or write the
-# training loop yourself: the gradient of any loss is `eqx.filter_grad(loss)(params)`.
-# `covariance=False`, since weights have no meaning of their own.
+# `fit` used Levenberg-Marquardt, its default for up to 64 parameters. It takes the
+# derivatives of all samples with respect to all weights, through the non-iterative step. For
+# larger networks pass an optax optimiser, such as `fit(residuals, start, optax.adam(1e-2))`.
+# Or write the training loop yourself: the gradient of any loss is
+# `eqx.filter_grad(loss)(params)`. We set `covariance=False`, because single weights have no
+# meaning.
 #
-# What the gradient costs, in reverse mode, and how the loops over the steps run:
+# The next cell shows the cost of the gradient in reverse mode, and how the loops over the
+# steps run:
 
 # %%
 values, functions = eqx.partition(start, eqx.is_array)
@@ -187,11 +189,11 @@ print(
 print(hhtjax.explain(jax.value_and_grad(loss), values))
 
 # %% [markdown]
-# ## What it found
+# ## What did it find?
 #
-# **Look at** the shaded regions: there the training record has no data. Inside, the curve
-# must be right. Outside, nothing has checked it: do not use it there, even where it goes on
-# well, as it may here (see the last number).
+# **Look at** the shaded regions. There the training record has no data. Elsewhere the curve
+# must be right. Do not use it in the shaded regions: nothing has checked it there, even if it
+# looks right, as it may here (see the last number).
 
 # %%
 seen = float(jnp.abs(truth_train.v).max())
@@ -242,8 +244,8 @@ plt.show()
 #
 # ## A record it has not seen
 #
-# **Look at** the residual: that of the grey box should be nothing but noise. All velocities
-# of the test lie within those of the training record, which the cell asserts.
+# **Look at** the residual. That of the grey box should be only noise. All velocities of the
+# test lie within those of the training record; the cell asserts this.
 
 # %%
 residuals = {
@@ -275,10 +277,10 @@ plt.show()
 # %% [markdown]
 # ## What to try next
 #
-# * Train on `multisine(0, 2.0)` and test on the stronger record: where does the model leave
+# * Train on `multisine(0, 2.0)` and test on the stronger record. Where does the model leave
 #   the data?
-# * Take the arsinh away, `x = v / 0.05`: where does training get stuck?
-# * Let the unknown part depend on position too, `eqx.nn.MLP(2, "scalar", ...)`: does it find
+# * Remove the arsinh: `x = v / 0.05`. Where does the training stop?
+# * Let the unknown part depend on position too: `eqx.nn.MLP(2, "scalar", ...)`. Does it find
 #   the same `k`? Why not?
-# * Replace the sum by Stribeck's formula with five parameters, now that its shape is seen:
-#   notebook 3 has their errors.
+# * Replace the sum by Stribeck's formula with five parameters, now that its shape is known.
+#   Notebook 3 shows how to get their errors.

@@ -1,14 +1,14 @@
 # %% [markdown]
 # # 10. A measured double pendulum
 #
-# A camera followed the two arms of a double pendulum (Schmidt and Lipson 2009): angles at
-# about 100 Hz, with gaps, no input, and a motion that is chaotic when it is large. We find
-# inertia, weights and friction, from **short windows** of the record, each with an initial
-# state of its own.
+# A camera followed the two arms of a double pendulum (Schmidt and Lipson 2009). The record
+# has angles at about 100 Hz, with gaps and without an input. The motion is chaotic when it is
+# large. We estimate inertia, weights and friction from **short windows** of the record, each
+# with its own initial state.
 #
-# The file real_double_pend_h_1.txt belongs to the paper's supplementary data. Put it into a
-# folder `double_pendulum/`, and let `HHTJAX_DATA` name the folder that holds it. Without it,
-# the notebook makes a record of the same kind, and says so.
+# The file real_double_pend_h_1.txt belongs to the supplementary data of the paper. Put it
+# into a folder `double_pendulum/`, and set `HHTJAX_DATA` to the folder that contains it.
+# Without it, the notebook generates a record of the same kind, and says so.
 
 # %%
 import os
@@ -39,13 +39,13 @@ print(
 # ## The model
 #
 # Both angles are measured from the downward vertical. Divided by the inertia of the first
-# arm,
+# arm, the mass matrix is
 #
 # $$M = \begin{pmatrix} 1 & B\cos(q_1 - q_2)\\ \cdot & A\end{pmatrix}$$
 #
-# and the forces are weights $g_1 \sin q_1$, $g_2 \sin q_2$, the terms that go with $M$, and
-# viscous friction in both joints. Only these ratios can be found from angles alone. A
-# dictionary of parameters, two of them arrays:
+# The forces are weights $g_1 \sin q_1$ and $g_2 \sin q_2$, the velocity terms that belong to
+# $M$, and viscous friction in both joints. Angles alone determine only these ratios. The
+# parameters are a dictionary; two of them are arrays:
 
 
 # %%
@@ -101,13 +101,14 @@ print(
 # %% [markdown]
 # ## Windows
 #
-# Over a few seconds the derivative of a chaotic motion in its parameters explodes (notebook
-# 6), and a fit over the whole record gets lost. `windows` cuts it into pieces of equal
-# duration; they follow the clock, so gaps do not matter. The initial state of each piece is
-# fitted along (`starts=`), and eliminated: the Jacobian stays small however many windows.
-# `interpolate` takes the run to the times of the samples.
+# Over a few seconds the derivative of a chaotic motion with respect to its parameters becomes
+# huge (notebook 6), and a fit over the whole record fails. `windows` cuts the record into
+# pieces of equal duration. It uses the time stamps, so gaps do not matter. The initial state
+# of each piece is fitted as well (`starts=`) and then eliminated. So the Jacobian stays small
+# for any number of windows. `interpolate` evaluates the run at the times of the samples.
 #
-# The tracker's zero may be off by a small angle: `offset`, two more unknowns.
+# The zero of the camera may be wrong by a small angle. `offset` adds two more unknowns for
+# this.
 
 
 # %%
@@ -150,9 +151,9 @@ if not measured:
 # %% [markdown]
 # ## One window, and all residuals
 #
-# **Look at** the left for what is fitted, and at the right for what is left of it. Residuals
-# that rise and fall together are the model's own error (the joints' friction is hardly
-# viscous, the arms are not rigid); scatter would be noise.
+# **Look at** the fit on the left, and at the residuals on the right. Residuals that rise and
+# fall together are the error of the model: the friction of the joints is hardly viscous, and
+# the arms are not rigid. Noise would be scatter.
 
 # %%
 k = int(np.argmax(np.ptp(records.y[:, :, 0], axis=1)))
@@ -182,8 +183,8 @@ plt.show()
 # %% [markdown]
 # ## How long can it predict?
 #
-# The same parameters over longer and longer windows, with the initial state as fitted at the
-# beginning: the error grows as neighbouring motions part.
+# The same parameters predict longer and longer windows, from the fitted initial state. The
+# error grows because neighbouring motions separate.
 
 # %%
 every = np.arange(0, len(records.begin), 2)
@@ -223,8 +224,8 @@ print(
 # %% [markdown]
 # ## What to try next
 #
-# * Add dry friction, `d * jnp.tanh(v / 0.1)`, in both joints: does the error fall?
-# * Windows of 2 s at once from `guess`, and step by step with `hhtjax.fit_progressively`:
-#   which arrives?
-# * The full study, with held-out parts and an unseen trial:
+# * Add dry friction, `d * jnp.tanh(v / 0.1)`, in both joints. Does the error fall?
+# * Fit windows of 2 s at once from `guess`, and step by step with `hhtjax.fit_progressively`.
+#   Which one arrives?
+# * For the full study, with held-out parts and an unseen trial, run
 #   `python -m experiments double_pendulum_measured`.

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # 12. A beam with 200 degrees of freedom
 #
-# Beams, chains and frames have many unknowns, each coupled to a few neighbours only. Two ways
-# to use that: a `LinearSystem`, whose matrix is factorised once for the whole run; and, where
-# something nonlinear happens, a solver that knows of the **bands** of the matrix.
+# Beams, chains and frames have many unknowns, each coupled only to a few neighbours. There
+# are two ways to use this. A `LinearSystem` factorises its matrix once for the whole run. For
+# nonlinear systems, a solver can use the **bands** of the matrix.
 
 # %%
 import time
@@ -21,9 +21,9 @@ plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 # %% [markdown]
 # ## The beam
 #
-# A steel strip, 1 m long, 30 mm wide and 3 mm thick, simply supported at both ends.
-# $\rho A\,\ddot w + EI\,w'''' = f$, by finite differences at 200 places inside: the second
-# difference twice. Its mass matrix is a diagonal.
+# A steel strip is 1 m long, 30 mm wide and 3 mm thick, and simply supported at both ends. Its
+# equation is $\rho A\,\ddot w + EI\,w'''' = f$. We use finite differences at 200 interior
+# points: the second difference twice. The mass matrix is a diagonal.
 
 # %%
 N, LENGTH = 200, 1.0
@@ -54,8 +54,8 @@ print(
 # %% [markdown]
 # ## Struck with a hammer: linear
 #
-# A half-sine blow of 1 ms at a quarter of the length. The step, 0.2 ms, resolves the first
-# modes; the highest ones are damped by the method (`alpha=-0.1`) instead of being resolved.
+# The blow is a half sine of 1 ms at a quarter of the length. The step of 0.2 ms resolves the
+# first modes. The highest modes are not resolved; the method damps them (`alpha=-0.1`).
 
 # %%
 DT, STEPS = 2e-4, 2500
@@ -108,16 +108,16 @@ right.set(xlabel="frequency (Hz)", ylabel="amplitude at a sixth\nof the length",
 plt.show()
 
 # %% [markdown]
-# **Look at** the left for the bulge that runs up and down the beam, and at the right for the
+# **Look at** the left for the bulge that travels along the beam, and at the right for the
 # peaks at the theoretical frequencies (dotted).
 #
 # ## With a stop: nonlinear
 #
-# Now the middle hits a stop 3 mm away, a one-sided spring. One nonlinear force among 200
-# unknowns, and the matrix changes in time. `hht(solve=hhtjax.banded(2))` finds the five bands
-# of a step's matrix with five derivatives in place of 200, and eliminates within them. Was
-# the number of bands right? The solver looks at what it leaves unsolved, and `check()` would
-# say so.
+# Now the middle hits a stop 3 mm away, a one-sided spring. This is one nonlinear force among
+# 200 unknowns, and the matrix changes in time. `hht(solve=hhtjax.banded(2))` computes the
+# five bands of a step's matrix from five derivatives instead of 200, and eliminates within
+# the bands. Was the number of bands right? The solver checks what it leaves unsolved, and
+# `check()` would report it.
 
 
 # %%
@@ -163,6 +163,6 @@ print(
 # %% [markdown]
 # ## What to try next
 #
-# * Halve the step: does the force of the stop change? It is a contact; see notebook 7.
-# * N = 2000, with `banded(2)`: the time of a step should grow tenfold, not a hundredfold.
-# * Make EI a parameter, and differentiate the deflection in it.
+# * Halve the step. Does the force of the stop change? It is a contact; see notebook 7.
+# * Take N = 2000 with `banded(2)`. The time of a step should grow tenfold, not a hundredfold.
+# * Make EI a parameter, and differentiate the deflection with respect to it.
