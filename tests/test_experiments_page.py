@@ -11,6 +11,10 @@ from experiments.html_report import page
 from experiments.html_tables import render
 from experiments.results import Result, of_experiments
 
+CAPTION = (  # of its page
+    "Silverbox: measured and simulated output of the arrow test with its residual, a detail about the peak, and both "
+    "spectra"
+)
 EMPTY = {"meta", "img", "wbr", "br"}
 
 
@@ -115,7 +119,7 @@ def test_figures_go_to_the_experiment_with_the_longest_name(tmp_path):
     (tmp_path / "vehicle.json").write_text(json.dumps({"records": 1}))
     found = {r.name: [(p.name, caption) for p, caption in r.figures] for r in of_experiments(EXPERIMENTS, tmp_path)}
     assert found == {
-        "silverbox": [("silverbox_fit.png", "Measured and simulated output")],
+        "silverbox": [("silverbox_fit.png", CAPTION)],
         "silverbox_comparison": [("silverbox_comparison_far.png", "far")],
         "vehicle": [],
     }

@@ -16,7 +16,7 @@ def rms_table(name, entries):
         if e["misprint"]:
             printed = f"**{printed}** [{e['read_as_rad']:.4e}]"
         off = e["reference_error_rad"]
-        last = f"reference off by {off:.2e}" if off else f"{100 * e['relative_difference']:+.2f} %"
+        last = f"reference error {off:.2e}" if off else f"{100 * e['relative_difference']:+.2f} %"
         rows.append([f"{e['h_s']:g}", e["angle"], e["method"], f"{e['ours_rad']:.4e}", printed, last])
     return f"**{name}**\n\n" + table(["h (s)", "angle", "method", "ours", "printed", "difference"], rows)
 
@@ -87,7 +87,10 @@ def timing_table(numbers):
     header = ["pendulum", "method"] + [
         f"{x}, h = {h}" for h in ("1e-3", "1e-1") for x in ("time", "iterations", "error x time")
     ]
-    return "Per step, over implicit Euler's in the same run, with alpha = 0:\n\n" + table(header, rows)
+    return (
+        "Warm time per step, and error times time, over implicit Euler's in the same run, with alpha = 0:\n\n"
+        + table(header, rows)
+    )
 
 
 def splitting_table(numbers):

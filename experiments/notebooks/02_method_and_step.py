@@ -1,9 +1,9 @@
 # %% [markdown]
 # # 2. Choosing a method and a step size
 #
-# Every step makes a small error. This notebook shows what that error does to a vibration, how it shrinks with the step,
-# which methods survive stiffness, and how to ask the library for a step size. At the end there is a short table of
-# advice.
+# Every step makes a small error. This notebook shows what the error does to a vibration, how
+# it falls with the step, and which methods work on stiff systems. It then asks the library
+# for a step size and for a method. A short table of advice is at the end.
 
 # %%
 import time
@@ -20,14 +20,16 @@ jax.config.update("jax_enable_x64", True)
 plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 
 # %% [markdown]
-# ## What a step does to one vibration
+# ## What does a step do to one vibration?
 #
-# Take one undamped oscillator of circular frequency $\omega$ and step it with $h$. All that matters is $\omega h$: at
-# $\omega h = 2\pi/20 \approx 0.31$ there are 20 steps per period. Two errors can be seen: the period comes out too long
-# or too short, and the amplitude decays (**numerical damping**, given as a damping ratio, or Lehr's measure) or grows.
+# Take one undamped oscillator of circular frequency $\omega$ and step it with $h$. Only
+# $\omega h$ matters. At $\omega h = 2\pi/20 \approx 0.31$ there are 20 steps per period. Two
+# errors are visible. The period is too long or too short. The amplitude decays or grows; the
+# decay is called **numerical damping** and is given as a damping ratio (Lehr's damping).
 #
-# **Look at** the left of each figure: that is where you want to be for the vibrations that matter to you. The right is
-# where the vibrations live that your model has, but that you do not want to resolve: there damping is welcome.
+# **Look at** the left part of each figure for the vibrations that matter to you. The right
+# part is for vibrations that your model has and that you do not want to resolve. There
+# damping is welcome.
 
 # %%
 steppers = {
@@ -49,21 +51,29 @@ figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", nco
 plt.show()
 
 for name, stepper in steppers.items():
-    period, damping = (float(f(stepper, 2 * np.pi / 20)) for f in (analysis.period_elongation, analysis.damping_ratio))
-    print(f"20 steps a period, {name:<24} period {100 * period:+.3f} %, damping ratio {100 * damping:+.4f} %")
+    period, damping = (
+        float(f(stepper, 2 * np.pi / 20))
+        for f in (analysis.period_elongation, analysis.damping_ratio)
+    )
+    print(
+        f"20 steps a period, {name:<24} period {100 * period:+.3f} %, damping ratio "
+        f"{100 * damping:+.4f} %"
+    )
 
 # %% [markdown]
-# A rule of thumb from these numbers: with `hht`, 20 steps per period lengthen the period by about one per cent, and
-# since the method is of **second order**, 40 steps by a quarter of that.
+# A rule of thumb from these numbers: with `hht`, 20 steps per period lengthen the period by
+# about one per cent. The method has **second order**, so with 40 steps it is a quarter of
+# that.
 #
-# ## Error against step size
+# ## How does the error fall with the step size?
 #
-# Order $p$ means that the error of a smooth motion shrinks like $h^p$. Measured here on a driven Duffing oscillator (a
-# mass on a hardening spring, $\ddot q + 0.2\,\dot q + q + q^3 = 0.8 \cos 1.3\,t$), against a run with very small steps.
-# `analysis.observed_order` does the runs.
+# Order $p$ means that the error of a smooth motion falls like $h^p$. We measure it on a
+# driven Duffing oscillator, a mass on a hardening spring:
+# $\ddot q + 0.2\,\dot q + q + q^3 = 0.8 \cos 1.3\,t$. The reference is a run with very small
+# steps. `analysis.observed_order` does the runs.
 #
-# **Look at** the slopes, and at the horizontal distances: how many more steps one method needs than another for the
-# same error.
+# **Look at** the slopes, and at the horizontal distances. A distance shows how many more
+# steps one method needs than another for the same error.
 
 # %%
 scene = hhtjax.scenes.duffing.driven()
@@ -78,11 +88,18 @@ candidates = {
 
 
 def order_of(stepper, num_steps, **options):
-    return analysis.observed_order(scene.system, stepper, *start, duration=10.0, num_steps=num_steps, **options)
+    return analysis.observed_order(
+        scene.system, stepper, *start, duration=10.0, num_steps=num_steps, **options
+    )
 
 
-fine = hhtjax.simulate(scene.system, hhtjax.rk4(), *start, dt=10.0 / 20000, num_steps=20000, save_every=20000)
-found = {name: order_of(s, (200, 400, 800, 1600, 3200), reference=fine.q[-1]) for name, s in candidates.items()}
+fine = hhtjax.simulate(
+    scene.system, hhtjax.rk4(), *start, dt=10.0 / 20000, num_steps=20000, save_every=20000
+)
+found = {
+    name: order_of(s, (200, 400, 800, 1600, 3200), reference=fine.q[-1])
+    for name, s in candidates.items()
+}
 axes = hhtjax.plot.error_against_h(found, unit="m")
 axes.figure.set_size_inches(5.6, 3.6)
 plt.show()
@@ -90,11 +107,12 @@ for name, result in found.items():
     print(f"{name:<15} slopes {np.round(result.slope, 2)}")
 
 # %% [markdown]
-# ## Stiffness: who survives
+# ## Which methods work on stiff systems?
 #
-# A weight of 1 kg swings on a rod. Give the rod its true stiffness, 1 MN/m, and there is a vibration along the rod with
-# $\sqrt{k/m}$ = 1000 rad/s besides the swinging with some 4 rad/s. Nobody wants to see the fast one. An **explicit**
-# method such as RK4 has to resolve it all the same, or it blows up; an **implicit** one does not.
+# A weight of 1 kg swings on a rod. With its true stiffness of 1 MN/m the rod vibrates along
+# its axis with $\sqrt{k/m}$ = 1000 rad/s. The swinging has about 4 rad/s. The fast vibration
+# is not of interest. An **explicit** method such as RK4 must resolve it anyway, or it blows
+# up. An **implicit** method need not.
 
 # %%
 pendulum = hhtjax.scenes.pendulum.elastic(k=1e6)
@@ -106,9 +124,13 @@ for name, stepper, dt in [
     ("hht, 20 ms", hhtjax.hht(), 2e-2),
 ]:
     n = round(1.0 / dt)
-    run = hhtjax.simulate(pendulum.system, stepper, pendulum.q0, pendulum.v0, pendulum.params, dt=dt, num_steps=n)
+    run = hhtjax.simulate(
+        pendulum.system, stepper, pendulum.q0, pendulum.v0, pendulum.params, dt=dt, num_steps=n
+    )
     try:
-        run.check(reach=2.0)  # a run that gets farther than 2 m from its start counts as failed too
+        run.check(
+            reach=2.0
+        )  # a run that gets farther than 2 m from its start counts as failed too
         angle[name] = run.t, jnp.degrees(jnp.arctan2(run.q[:, 0], -run.q[:, 1]))
         print(f"{name}: fine, with {n} steps")
     except hhtjax.SimulationError as error:
@@ -124,22 +146,26 @@ plt.show()
 # %% [markdown]
 # ## Ask for a step size
 #
-# `analysis.suggest_step_size` answers in two ways. Without a duration it looks at the vibrations about the initial
-# state, and at what the stepper makes of each. With one, it runs the motion with halved steps until the error stays
-# within the tolerance: slower, but it sees everything that happens on the way.
+# `analysis.suggest_step_size` has two ways to answer. Without a duration it looks at the
+# vibrations about the initial state and at the error of the stepper for each. With a duration
+# it simulates the motion with halved steps until the error stays within the tolerance. This
+# is slower, but it covers the whole motion.
 
 # %%
 by_modes = analysis.suggest_step_size(scene.system, hhtjax.hht(), *start, tolerance=1e-2)
-by_runs = analysis.suggest_step_size(scene.system, hhtjax.hht(), *start, tolerance=1e-2, duration=10.0)
+by_runs = analysis.suggest_step_size(
+    scene.system, hhtjax.hht(), *start, tolerance=1e-2, duration=10.0
+)
 print("by the modes:", by_modes, "\n")
 print("by runs:     ", by_runs)
 
 # %% [markdown]
-# ## What a step costs
+# ## What does a step cost?
 #
-# The methods differ in work per step. Timed below: 20000 steps of the same oscillator, after a first call that
-# compiles. (Absolute numbers depend on this machine; the ratios less so.) `iterations=None` repeats Newton's iteration
-# until the equations hold to rounding; the default does one solve a step, and has the same order.
+# The methods differ in work per step. We time 20000 steps of the same oscillator, cold (the
+# first call, which compiles) and warm (later calls). Absolute numbers depend on the machine,
+# ratios less so. `iterations=None` repeats Newton's iteration until the equations hold to
+# rounding. The default takes one solve per step and has the same order.
 
 
 # %%
@@ -147,68 +173,101 @@ def nanoseconds(stepper, **options):
     def run():
         begin = time.perf_counter()
         jax.block_until_ready(
-            hhtjax.simulate(scene.system, stepper, *start, dt=1e-3, num_steps=20000, save_every=2000, **options)
+            hhtjax.simulate(
+                scene.system,
+                stepper,
+                *start,
+                dt=1e-3,
+                num_steps=20000,
+                save_every=2000,
+                **options,
+            )
         )
         return 1e9 * (time.perf_counter() - begin) / 20000
 
     return run(), min(run() for _ in range(5))
 
 
-for name, stepper in {**candidates, "hht, Newton": hhtjax.hht(alpha=-0.05, iterations=None)}.items():
+for name, stepper in {
+    **candidates,
+    "hht, Newton": hhtjax.hht(alpha=-0.05, iterations=None),
+}.items():
     first, later = nanoseconds(stepper)
-    print(f"{name:<15} {later:6.0f} ns a step;  first call, with compiling: {first * 20000 / 1e9:.1f} s")
+    print(
+        f"{name:<15} {later:6.0f} ns a step;  first call, with compiling: "
+        f"{first * 20000 / 1e9:.1f} s"
+    )
 
 # %% [markdown]
 # ## More order from the same method
 #
-# Where the motion is smooth, `extrapolate=2` runs with $h$ and $h/2$ and takes the leading error out of both
-# (Richardson's extrapolation): one order more, for three times the work; two orders for `alpha=0`, as here.
+# For a smooth motion use `extrapolate=2`. It runs with $h$ and $h/2$ and removes the leading
+# error (Richardson extrapolation). This gives one more order for three times the work. With
+# `alpha=0`, as here, it gives two more orders.
 
 # %%
-sharp = hhtjax.hht(alpha=0.0, linearize="predictor")  # smooth in everything, which extrapolation needs
+sharp = hhtjax.hht(
+    alpha=0.0, linearize="predictor"
+)  # smooth in everything, which extrapolation needs
 for extrapolate in (1, 2):
     error = []
     for n in (200, 400):
         run = hhtjax.simulate(
-            scene.system, sharp, *start, dt=10 / n, num_steps=n, save_every=n, extrapolate=extrapolate
+            scene.system,
+            sharp,
+            *start,
+            dt=10 / n,
+            num_steps=n,
+            save_every=n,
+            extrapolate=extrapolate,
         )
         error.append(float(jnp.abs(run.q[-1] - fine.q[-1])[0]))
-    print(f"extrapolate={extrapolate}: error {error[0]:.1e} with 200 steps, {error[1]:.1e} with 400: order "
-          f"{np.log2(error[0] / error[1]):.1f}")  # fmt: skip
+    print(
+        f"extrapolate={extrapolate}: error {error[0]:.1e} with 200 steps, "
+        f"{error[1]:.1e} with 400: order {np.log2(error[0] / error[1]):.1f}"
+    )
 
 # %% [markdown]
 # ## Ask for a method
 #
-# `analysis.choose_stepper` tries: how long a step the wanted error asks for, and how fast the system could answer to a
-# push along the way. Their product tells what is stiff. It gives a method and tolerances that keep to the error.
+# `analysis.choose_stepper` makes test runs. It finds how long a step the wanted error allows,
+# and how fast the system can react to a push along the way. The product of the two says
+# whether the system is stiff. It returns a method and tolerances that keep the error.
 #
-# **Look at** what a smaller tolerance changes for the oscillator, and at what makes the elastic pendulum stiff.
+# **Look at** what a smaller tolerance changes for the oscillator, and at what makes the
+# elastic pendulum stiff.
 
 # %%
 rod = pendulum.q0, pendulum.v0, pendulum.params
 for tolerance in (1e-2, 1e-8):
     print(
-        f"oscillator, {tolerance:g}:", analysis.choose_stepper(scene.system, *start, duration=10, tolerance=tolerance)
+        f"oscillator, {tolerance:g}:",
+        analysis.choose_stepper(scene.system, *start, duration=10, tolerance=tolerance),
     )
-print("pendulum, 0.01:", analysis.choose_stepper(pendulum.system, *rod, duration=1, tolerance=1e-2))
+print(
+    "pendulum, 0.01:",
+    analysis.choose_stepper(pendulum.system, *rod, duration=1, tolerance=1e-2),
+)
 
 # %% [markdown]
 # ## Advice
 #
-# | your system | take | why |
+# | your system | method | reason |
 # |---|---|---|
-# | stiff springs, contacts, constraints; nothing known | `hht()` | one solve a step, damps what is not resolved |
-# | the same, and a fit through the run | `hht(linearize="predictor")` | smooth in its parameters |
-# | no energy may be lost, everything is resolved | `hht(alpha=0.0)` | no numerical damping at all, at any frequency |
+# | stiff springs, contacts, constraints, unknown | `hht()` | one solve, damps fast modes |
+# | as above, fit through the run | `hht(linearize="predictor")` | smooth in its parameters |
+# | must lose no energy, everything resolved | `hht(alpha=0.0)` | no numerical damping |
 # | stiff, more than three digits | `rodas5p()` with `dt=adaptive(rtol, atol)` | order 5 |
-# | constraints or rotations, more than two digits | `extrapolated()`, likewise | order 5 |
-# | smooth, nothing stiff | `tsit5()`; `taylor()` or `dop853()` from four digits on, likewise | no Jacobian |
+# | constraints or rotations, over two digits | `extrapolated()`, with `adaptive` | order 5 |
+# | smooth, not stiff | `tsit5()`, with `adaptive` | no Jacobian |
+# | as above, four digits or more | `taylor()` or `dop853()`, with `adaptive` | high order |
 #
-# Then ask `suggest_step_size`, or halve the step and compare, as in notebook 1. What all of these take on eight scenes,
-# and what other packages do, is [one page](../work_precision/README.md).
+# Then ask `suggest_step_size`, or halve the step and compare, as in notebook 1. [Work and
+# precision](../work_precision/README.md) compares the times of all these methods and of other
+# packages on eight scenes.
 #
 # ## What to try next
 #
-# * Where does `hht(-0.3)` cross `hht(-0.05)` in the error figure? Add it to `candidates`.
-# * Let the rod of the pendulum be 100 times softer: which step does RK4 need now?
-# * Notebook 6 shows what goes wrong beyond all this advice.
+# * Add `hht(-0.3)` to `candidates`. Where does it cross `hht(-0.05)` in the error figure?
+# * Make the rod of the pendulum 100 times softer. Which step does RK4 need now?
+# * Notebook 6 shows failures that this advice does not prevent.

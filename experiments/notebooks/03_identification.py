@@ -1,13 +1,15 @@
 # %% [markdown]
 # # 3. Parameters from measured data
 #
-# An electronic oscillator was driven by a known voltage $u$, and its output $y$ was recorded: the Silverbox benchmark
-# of Wigren and Schoukens (2013). We find mass, damping and stiffness from the record, with standard errors; ask which
-# term the model lacks; test it on data it has not seen; and see what the step size does to the result.
+# An electronic oscillator was driven by a known voltage $u$, and its output $y$ was recorded:
+# the Silverbox benchmark of Wigren and Schoukens (2013). We estimate mass, damping and
+# stiffness with standard errors. We find a term that the model lacks, test the model on
+# unseen data, and see what the step size does to the result.
 #
-# The data are public (nonlinearbenchmark.org, file SNLS80mV.csv) but not ours to hand on. Put the file into a folder
-# `silverbox/` and let the environment variable `HHTJAX_DATA` name the folder that holds it. Without it this notebook
-# makes a record of the same kind with known parameters, and says so.
+# The data are public (nonlinearbenchmark.org, file SNLS80mV.csv), but we may not redistribute
+# them. Put the file into a folder `silverbox/` and set the environment variable `HHTJAX_DATA`
+# to the folder that contains it. Without it this notebook generates a record of the same kind
+# with known parameters, and says so.
 
 # %%
 import os
@@ -25,23 +27,38 @@ jax.config.update("jax_enable_x64", True)
 plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 
 RATE = 1e7 / 2**14  # samples per second
-TRUE = {"m": 5.4e-6, "c": 2.2e-4, "k": 1.0, "k2": -0.03, "k3": 4.0, "offset": -5e-3, "c2": 1.5e-3, "d": 0.0}
+TRUE = {
+    "m": 5.4e-6,
+    "c": 2.2e-4,
+    "k": 1.0,
+    "k2": -0.03,
+    "k3": 4.0,
+    "offset": -5e-3,
+    "c2": 1.5e-3,
+    "d": 0.0,
+}
 TRAIN, TEST = 16000, 16000  # samples
 
 file = Path(os.environ.get("HHTJAX_DATA", ".")) / "silverbox" / "SNLS80mV.csv"
 measured = file.is_file()
-print("MEASURED record (Silverbox)" if measured else f"GENERATED record with known parameters; {file} is not there")
+print(
+    "MEASURED record (Silverbox)"
+    if measured
+    else f"GENERATED record with known parameters; {file} is not there"
+)
 
 # %% [markdown]
 # ## The model
 #
 # $$m\ddot y + (c + c_2 y^2 + d\,|\dot y|)\,\dot y + k y + k_2 y^2 + k_3 y^3 = u(t) + u_0$$
 #
-# with $u$ and $y$ in V. Only ratios can be found from a voltage and a voltage, so the gain of the input is set to 1,
-# and $m$, $c$, $k$ have no SI units of mass, damping and stiffness but those of V per V s², and so on.
+# $u$ and $y$ are in V. From two voltages only ratios can be found, so the gain of the input
+# is set to 1. Therefore $m$, $c$ and $k$ do not have the SI units of mass, damping and
+# stiffness, but V per V s², and so on.
 #
-# The input between its samples matters as soon as there is more than one step per sample. These signals hold
-# frequencies well below half the sampling rate, and `band_limited` reconstructs them.
+# With more than one step per sample the input between samples matters. These signals contain
+# only frequencies well below half the sampling rate. `band_limited` reconstructs such
+# signals.
 
 
 # %%
@@ -62,7 +79,9 @@ def output(params, start, u, samples, substeps):
     """y at the samples, in V, by `substeps` steps from each to the next."""
     run = hhtjax.simulate(
         oscillator,
-        hhtjax.hht(alpha=0.0, linearize="predictor"),  # smooth in the parameters: what a fit needs
+        hhtjax.hht(
+            alpha=0.0, linearize="predictor"
+        ),  # smooth in the parameters: what a fit needs
         jnp.reshape(start["y"], (1,)),
         jnp.reshape(start["v"], (1,)),
         params | {"u": u},
@@ -74,7 +93,8 @@ def output(params, start, u, samples, substeps):
 
 
 def generate(samples):
-    """A record from known parameters: noise up to 200 Hz as input, 16 steps per sample, 0.3 mV of noise at the end."""
+    """A record from known parameters: noise up to 200 Hz as input, 16 steps per sample, and
+    0.3 mV of noise on the output."""
     rng = np.random.default_rng(0)
     spectrum = np.fft.rfft(rng.normal(size=samples))
     spectrum[np.fft.rfftfreq(samples, 1 / RATE) > 200.0] = 0
@@ -85,19 +105,25 @@ def generate(samples):
 
 
 if measured:
-    u_all, y_all = np.loadtxt(file, delimiter=",", skiprows=1, usecols=(0, 1)).T[:, 40650:127400]  # the multisine
+    u_all, y_all = np.loadtxt(file, delimiter=",", skiprows=1, usecols=(0, 1)).T[
+        :, 40650:127400
+    ]  # the multisine
 else:
     u_all, y_all = generate(TRAIN + TEST)
 train = slice(0, TRAIN)
 test = slice(len(y_all) - TEST, len(y_all))
-print(f"{TRAIN} samples to learn from, {TEST} others to be judged by; RMS of the output {1e3 * y_all.std():.1f} mV")
+print(
+    f"{TRAIN} samples to learn from, {TEST} others to be judged by; RMS of the output "
+    f"{1e3 * y_all.std():.1f} mV"
+)
 
 # %% [markdown]
 # ## A fit
 #
-# `residuals` is any function of the unknowns; `fit` changes them until the sum of its squares is least, by
-# Levenberg-Marquardt on exact derivatives of the whole run. The initial position and velocity are unknown too, so they
-# are fitted along. The start is crude: a linear oscillator with the resonance that the spectrum shows, near 68 Hz.
+# `residuals` is any function of the unknowns. `fit` minimises the sum of their squares by
+# Levenberg-Marquardt, with exact derivatives of the whole run. The initial position and
+# velocity are unknown too, so they are fitted as well. The start is crude: a linear
+# oscillator with the resonance that the spectrum shows, near 68 Hz.
 
 # %%
 NAMES = ("m", "c", "k", "k2", "k3", "offset")
@@ -123,16 +149,17 @@ first = hhtjax.fit(problem(4, ABSENT), (guess, start_of(train)), scale=(scale, s
 print(first.summary())
 
 # %% [markdown]
-# Read the table from the right. **error / naive**: textbook standard errors suppose that one residual tells nothing
-# about the next. Residuals of a measured system are correlated, because the model is never exact; so the library
-# estimates the errors from segments of the record (a cluster sandwich), and the last column says how many times larger
-# they are.
+# Read the table from the right. The column **error / naive** needs an explanation. Textbook
+# standard errors assume that residuals are independent. Residuals of a measured system are
+# correlated, because the model is never exact. So the library estimates the errors from
+# segments of the record (a cluster sandwich). The last column gives how many times larger
+# they are than the textbook errors.
 #
 # ## Which term is missing?
 #
-# The score test needs no second fit: it asks of each candidate how much of the residual it would explain. Above 10.8 a
-# term is there with 99.9 % confidence. Candidates: damping that grows with the amplitude, and damping that grows with
-# the speed.
+# The score test needs no second fit. It computes for each candidate how much of the residual
+# it would explain. A statistic above 10.8 means a term with 99.9 % confidence. The candidates
+# are damping that grows with the amplitude, and damping that grows with the speed.
 
 
 # %%
@@ -143,7 +170,10 @@ def with_candidates(unknown, extra):
 
 found = score_test(with_candidates, first.params, ABSENT)
 for name, statistic, drop in zip(found.names, found.statistic, found.cost_drop, strict=True):
-    print(f"{name:<3} statistic {statistic:5.1f}, would take away {100 * drop:4.1f} % of the cost")
+    print(
+        f"{name:<3} statistic {statistic:5.1f}, would take away {100 * drop:4.1f} % of the "
+        "cost"
+    )
 best = found.names[int(np.argmax(found.cost_drop))]
 print(f"the one to add: {best}")
 
@@ -154,25 +184,32 @@ print(f"the one to add: {best}")
 rest = {name: 0.0 for name in ABSENT if name != best}
 more_guess = {**first.params[0], best: 0.0}
 more_scale = {**scale, best: {"c2": 1e-3, "d": 1e-5}[best]}
-second = hhtjax.fit(problem(4, rest), (more_guess, first.params[1]), scale=(more_scale, scale_of_start))
+second = hhtjax.fit(
+    problem(4, rest), (more_guess, first.params[1]), scale=(more_scale, scale_of_start)
+)
 print(second.summary())
 if not measured:
     for name in second.params[0]:
         off = (second.params[0][name] - TRUE[name]) / second.standard_errors[0][name]
-        print(f"{name}: {off:+.1f} standard errors from the truth (the reason is the step size: see the end)")
+        print(
+            f"{name}: {off:+.1f} standard errors from the truth (the reason is the step "
+            "size: see the end)"
+        )
 
 # %% [markdown]
-# ## The judge: data that the fit has not seen
+# ## The test: data that the fit has not seen
 #
-# Both models predict the other part of the record from the input alone. Only the state at its beginning has to be
-# found, from the first 50 samples, which are not scored.
+# Both models predict the other part of the record from the input alone. Only the initial
+# state has to be estimated, from the first 50 samples, which are not scored.
 
 
 # %%
 def predict(params, part):
     u, y = hhtjax.band_limited(u_all[part], 1 / RATE), jnp.asarray(y_all[part])
     head = hhtjax.fit(
-        lambda start: output(ABSENT | params, start, u, 50, 4) - y[:50], start_of(part), scale=scale_of_start
+        lambda start: output(ABSENT | params, start, u, 50, 4) - y[:50],
+        start_of(part),
+        scale=scale_of_start,
     )
     return np.asarray(output(ABSENT | params, head.params, u, len(y), 4))
 
@@ -184,41 +221,60 @@ def millivolts(error):
 models = {"without the term": first, f"with {best}": second}
 predicted = {name: predict(result.params[0], test) for name, result in models.items()}
 for name, result in models.items():
-    on_train, on_test = millivolts(np.asarray(result.residual)), millivolts(predicted[name] - y_all[test])
-    print(f"{name:<18} RMS error {on_train:.3f} mV where it was fitted, {on_test:.3f} mV on the unseen part")
+    on_train, on_test = (
+        millivolts(np.asarray(result.residual)),
+        millivolts(predicted[name] - y_all[test]),
+    )
+    print(
+        f"{name:<18} RMS error {on_train:.3f} mV where it was fitted, {on_test:.3f} mV on "
+        "the unseen part"
+    )
 
 # %% [markdown]
-# **Look at** the residual in the middle, in its own units, and at the spectra below: where the residual comes near the
-# output, the model is wrong or the signal is noise.
+# **Look at** the residual in the middle, in its own units, and at the spectra below. Where
+# the residual is close to the output, the model is wrong or the signal is noise.
 
 # %%
 seconds = np.arange(TEST) / RATE
 axes = hhtjax.plot.fit_against_data(
-    seconds, y_all[test], predicted[f"with {best}"], unit="V", ylabel="output", show=(10.0, 10.4)
+    seconds,
+    y_all[test],
+    predicted[f"with {best}"],
+    unit="V",
+    ylabel="output",
+    show=(10.0, 10.4),
 )
 axes[0].figure.set_size_inches(6.5, 5.5)
 plt.show()
 
 # %% [markdown]
-# ## The step size belongs to the result
+# ## What does the step size do to the estimate?
 #
-# A parameter is fitted *through* the steps, and whatever the steps do to a vibration, the fit makes up for it. With $h$
-# equal to the sampling period, $\omega h$ is about 0.7 here: that is nine steps per period, and notebook 2 showed what
-# becomes of a period then. `step_size_bias` predicts the error of the stiffness (over the mass) and of the damping from
-# the steps alone, for small vibrations. Is it right? We fit with 1, 2 and 4 steps per sample and compare.
+# A parameter is fitted *through* the steps. The fit compensates for what the steps do to a
+# vibration. If $h$ equals the sampling period, $\omega h$ is about 0.7 here, or nine steps
+# per period. Notebook 2 showed what this does to a period. `step_size_bias` predicts the
+# resulting error of stiffness and damping (both divided by the mass) for small vibrations. We
+# check the prediction by fits with 1, 2 and 4 steps per sample.
 
 # %%
 fits = {1: None, 2: None, 4: second}
 for substeps in (1, 2):
     fits[substeps] = hhtjax.fit(
-        problem(substeps, rest), second.params, scale=(more_scale, scale_of_start), covariance=False
+        problem(substeps, rest),
+        second.params,
+        scale=(more_scale, scale_of_start),
+        covariance=False,
     )
 
 rows = []
 for substeps, result in fits.items():
     params = result.params[0]
-    linear = hhtjax.LinearSystem(*(jnp.reshape(params[name], (1,)) for name in ("m", "c", "k")))
-    bias = hhtjax.step_size_bias(linear, hhtjax.hht(0.0), None, 1 / RATE / substeps, q=jnp.zeros(1))
+    linear = hhtjax.LinearSystem(
+        *(jnp.reshape(params[name], (1,)) for name in ("m", "c", "k"))
+    )
+    bias = hhtjax.step_size_bias(
+        linear, hhtjax.hht(0.0), None, 1 / RATE / substeps, q=jnp.zeros(1)
+    )
     rows.append((substeps, params["k"] / params["m"], params["c"] / params["m"], bias))
 
 # the two finest, extrapolated to steps of no length: errors are of order h^2
@@ -235,13 +291,15 @@ print(f"standard error of k with 4 steps per sample: {100 * error:.3f} %")
 if not measured:
     exact = TRUE["k"] / TRUE["m"], TRUE["c"] / TRUE["m"]
     print(
-        "extrapolated, off from the truth:", *(f"{100 * (x / y - 1):.3f} %" for x, y in zip(limit, exact, strict=True))
+        "extrapolated, off from the truth:",
+        *(f"{100 * (x / y - 1):.3f} %" for x, y in zip(limit, exact, strict=True)),
     )
 
 # %% [markdown]
-# Compare the bias of the stiffness with its standard error, which knows nothing of it: that is the danger. Two
-# remedies: `hhtjax.refine` fits with $h$ and $h/2$ and extrapolates, as done by hand above; `step_size_bias(...,
-# correct=True)` takes the bias out afterwards.
+# Compare the bias of the stiffness with its standard error. The standard error does not
+# contain the bias, so the bias can go unnoticed. There are two remedies. `hhtjax.refine` fits
+# with $h$ and $h/2$ and extrapolates, as done by hand above.
+# `step_size_bias(..., correct=True)` removes the bias afterwards.
 
 # %%
 figure, axes = hhtjax.plot.subplots(width=130, height=70)
@@ -260,7 +318,9 @@ plt.show()
 # %% [markdown]
 # ## What to try next
 #
-# * Leave out `start_of` and start from rest: what happens to the residual at the beginning?
-# * `loss="huber"` and a few spoiled samples: notebook 11 does that with an arm.
-# * `transforms={"m": hhtjax.positive}`, `prior=`, `hhtjax.multistart`: see `help(hhtjax.fit)`.
-# * `hhtjax.identification.profile` draws how far one parameter can go while the others make up for it.
+# * Leave out `start_of` and start from rest. What happens to the residual at the beginning?
+# * Spoil a few samples and use `loss="huber"`. Notebook 11 does this with an arm.
+# * Try `transforms={"m": hhtjax.positive}`, `prior=` and `hhtjax.multistart`; see
+#   `help(hhtjax.fit)`.
+# * `hhtjax.identification.profile` plots the cost against one parameter while the others are
+#   fitted again.

@@ -1,13 +1,15 @@
 # %% [markdown]
 # # 4. Mechanisms with constraints, and rotations
 #
-# Many mechanisms are easier to describe with more coordinates than they have freedoms: the places of their joints, say,
-# together with the lengths of the bars, which must not change. The library steps such systems directly,
+# Many mechanisms are easier to describe with more coordinates than degrees of freedom. For
+# example, use the positions of the joints, and require that the bars keep their lengths. The
+# library simulates such systems directly,
 #
-# $$M(q)\,\ddot q = Q(q, \dot q, t) + B^T \lambda, \qquad \Phi(q, t) = 0, \qquad B = \partial\Phi/\partial q,$$
+# $$M(q)\,\ddot q = Q(q, \dot q, t) + B^T \lambda, \quad \Phi(q, t) = 0, \quad
+# B = \partial\Phi/\partial q,$$
 #
-# and returns the **multipliers** $\lambda$, the forces that keep the constraints. First a Watt linkage in the plane,
-# then a body that turns freely in space.
+# and returns the **multipliers** $\lambda$, which give the constraint forces. The first
+# example is a Watt linkage in the plane, the second a body that rotates freely in space.
 
 # %%
 import base64
@@ -27,21 +29,32 @@ plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 # %% [markdown]
 # ## Watt's linkage
 #
-# Two rockers of 0.4 m turn about fixed pivots. A coupler of 0.2 m joins their ends, and its middle P runs almost on a
-# straight line: that guided the piston rods of steam engines, and guides the rear axles of cars today.
+# Two rockers of 0.4 m turn about fixed pivots. A coupler of 0.2 m joins their ends. Its
+# middle P moves almost on a straight line. Steam engines used this to guide piston rods, and
+# cars use it to guide rear axles.
 #
-# Coordinates: the two joints, (2, 2), in m. Three bars, so three constraints; one freedom is left. For a slender bar
-# whose ends move, the mass matrix is known: $m/6\,[2\ 1;\ 1\ 2]$ for each direction. An axle of 5 kg sits in P, held by
-# a spring.
+# The coordinates are the positions of the two joints, (2, 2), in m. Three bars give three
+# constraints, so one degree of freedom is left. The mass matrix of a slender bar with moving
+# ends is $m/6\,[2\ 1;\ 1\ 2]$ for each direction. An axle of 5 kg is attached to P and held
+# by a spring.
 
 # %%
 PIVOTS = jnp.array([[0.0, 0.0], [0.8, 0.2]])
-params = {"rocker": 0.4, "coupler": 0.2, "bar": 1.0, "axle": 5.0, "k": 1500.0, "g": 9.81}  # m, kg, N/m, m/s^2
+params = {
+    "rocker": 0.4,
+    "coupler": 0.2,
+    "bar": 1.0,
+    "axle": 5.0,
+    "k": 1500.0,
+    "g": 9.81,
+}  # m, kg, N/m, m/s^2
 
 
 def mass(q, params):
     """Rows in the order of ravelled q: x and y of the first joint, then of the second."""
-    bars = params["bar"] / 6 * jnp.array([[2.0 + 2.0, 1.0], [1.0, 2.0 + 2.0]])  # a rocker and the coupler at each joint
+    bars = (
+        params["bar"] / 6 * jnp.array([[2.0 + 2.0, 1.0], [1.0, 2.0 + 2.0]])
+    )  # a rocker and the coupler at each joint
     axle = params["axle"] / 4 * jnp.ones((2, 2))  # P is the mean of both joints
     return jnp.kron(bars + axle, jnp.eye(2))
 
@@ -69,14 +82,16 @@ def constraint(q, t, params):
 watt = hhtjax.System(mass, force, constraint)
 
 # %% [markdown]
-# Initial values have to satisfy the constraints, and their time derivative too. `consistent_initial` takes a guess and
-# returns the nearest values that do.
+# Initial values must satisfy the constraints and their time derivatives. `consistent_initial`
+# takes a guess and returns the nearest values that do.
 
 # %%
 guess = jnp.array([[0.39, 0.07], [0.41, 0.27]])
 start = hhtjax.consistent_initial(watt, guess, jnp.zeros((2, 2)), params)
 print("joints:", start.q.round(4).tolist())
-run = hhtjax.simulate(watt, hhtjax.hht(alpha=0.0), start.q, start.v, params, dt=1e-3, num_steps=1000)
+run = hhtjax.simulate(
+    watt, hhtjax.hht(alpha=0.0), start.q, start.v, params, dt=1e-3, num_steps=1000
+)
 run.check()
 
 
@@ -96,10 +111,13 @@ left.plot(P[:, 0], P[:, 1], color="black", lw=1)
 right.plot(1e3 * (P[:, 0] - 0.4), P[:, 1])
 right.set(xlabel="sideways place of P, less 0.4 m (mm)", ylabel="height of P (m)")
 plt.show()
-print(f"P moves {1e3 * jnp.ptp(P[:, 1]):.0f} mm up and down, and {1e3 * jnp.ptp(P[:, 0]):.2f} mm sideways")
+print(
+    f"P moves {1e3 * jnp.ptp(P[:, 1]):.0f} mm up and down, and "
+    f"{1e3 * jnp.ptp(P[:, 0]):.2f} mm sideways"
+)
 
 # %% [markdown]
-# The same as a film:
+# The same motion as a film:
 
 # %%
 film = hhtjax.plot.animation(run, points, fps=12, speed=0.4, trace=1)
@@ -111,22 +129,27 @@ print(f"{len(content) // 1000} kB")
 display(HTML(f'<img alt="Watt linkage swinging" src="data:image/gif;base64,{content}">'))
 
 # %% [markdown]
-# ## Are the constraints kept, and the energy?
+# ## Are constraints and energy kept?
 #
-# By default both $\Phi = 0$ and $\dot\Phi = 0$ are enforced at every step, so there is no drift to watch for. The
-# energy balance compares the kinetic and potential energy with the work of all other forces, here none.
+# By default every step enforces both $\Phi = 0$ and $\dot\Phi = 0$, so there is no drift. The
+# energy balance compares kinetic and potential energy with the work of all other forces. Here
+# there are none.
 
 # %%
 balance = hhtjax.analysis.energy_balance(watt, run, params, potential=potential)
 swing = float(jnp.ptp(balance.potential))
 print(f"largest |Phi| {run.info.constraint.max():.1e} m^2")
-print(f"energy made or lost: at most {float(jnp.abs(balance.error).max()) / swing:.1e} of the {swing:.2f} J that swing")
+print(
+    f"energy made or lost: at most {float(jnp.abs(balance.error).max()) / swing:.1e} of "
+    f"the {swing:.2f} J that swing"
+)
 
 # %% [markdown]
 # ## Forces in the bars
 #
-# The constraint of a bar was written as half its squared length, so $B^T\lambda$ is $\lambda$ times the vector of the
-# bar: the force along it is $\lambda$ times its length, and a positive one pushes the ends apart.
+# The constraint of a bar is half its squared length. So $B^T\lambda$ is $\lambda$ times the
+# vector of the bar, and the force along the bar is $\lambda$ times its length. A positive
+# force pushes the ends apart.
 
 # %%
 lengths = jnp.array([params["rocker"], params["rocker"], params["coupler"]])
@@ -142,33 +165,40 @@ plt.show()
 # %% [markdown]
 # ## A derivative through the mechanism
 #
-# Lengths in the constraint are parameters like all others. What if the coupler were a little longer? We ask for the
-# height of P after one second, differentiated in the coupler's length. The starting position depends on that length
-# too, and `consistent_initial` is differentiated along.
+# Lengths in the constraint are parameters too. What changes if the coupler is a little
+# longer? We differentiate the height of P after one second with respect to the coupler's
+# length. The initial position depends on that length as well. `consistent_initial` is
+# differentiated along with the run.
 
 
 # %%
 def height_after_a_second(coupler):
     new = params | {"coupler": coupler}
     start = hhtjax.consistent_initial(watt, guess, jnp.zeros((2, 2)), new)
-    run = hhtjax.simulate(watt, hhtjax.hht(0.0), start.q, start.v, new, dt=1e-3, num_steps=1000, save_every=1000)
+    run = hhtjax.simulate(
+        watt, hhtjax.hht(0.0), start.q, start.v, new, dt=1e-3, num_steps=1000, save_every=1000
+    )
     return middle(run.q[-1])[1]
 
 
 height_and_slope = jax.jit(lambda coupler: jax.jvp(height_after_a_second, (coupler,), (1.0,)))
 _, slope = height_and_slope(0.2)
 around = [height_and_slope(0.2 + change)[0] for change in (1e-5, -1e-5)]
-print(f"{slope:.5f} by differentiation, {(around[0] - around[1]) / 2e-5:.5f} by finite differences (m per m)")
+print(
+    f"{slope:.5f} by differentiation, {(around[0] - around[1]) / 2e-5:.5f} by finite "
+    "differences (m per m)"
+)
 
 # %% [markdown]
 # ## Rotations
 #
-# A rotation is a matrix R (3, 3) in `q`, from the body's own axes to those of the room; its velocity is not the
-# matrix's derivative but the angular velocity $\Omega$ (3,) in the body's axes. Nothing else is needed: no angles that
-# become singular, no quaternions to normalise.
+# A rotation is a matrix R (3, 3) in `q`, from the body's axes to those of the room. Its
+# velocity is the angular velocity $\Omega$ (3,) in the body's axes, not the derivative of the
+# matrix. You need nothing else: there are no angles that become singular and no quaternions
+# to normalise.
 #
-# Throw a book in the air, spinning about its middle axis: it tumbles. Euler's equations say so, $J\dot\Omega = -\Omega
-# \times J\Omega$.
+# A book that is thrown with a spin about its middle axis tumbles. This follows from Euler's
+# equations, $J\dot\Omega = -\Omega \times J\Omega$.
 
 
 # %%
@@ -178,10 +208,21 @@ def gyroscopic(R, Om, t, params):
 
 book = hhtjax.System(mass=lambda R, params: params["J"], force=gyroscopic)
 J = jnp.array([1.0, 2.0, 2.7]) * 1e-3  # kg m^2
-spins = {"least": [10.0, 0.01, 0.01], "middle": [0.01, 10.0, 0.01], "largest": [0.01, 0.01, 10.0]}
+spins = {
+    "least": [10.0, 0.01, 0.01],
+    "middle": [0.01, 10.0, 0.01],
+    "largest": [0.01, 0.01, 10.0],
+}
 tumble = {
     name: hhtjax.simulate(
-        book, hhtjax.hht(alpha=0.0), jnp.eye(3), jnp.array(spin), {"J": J}, dt=2e-3, num_steps=4000, save_every=4
+        book,
+        hhtjax.hht(alpha=0.0),
+        jnp.eye(3),
+        jnp.array(spin),
+        {"J": J},
+        dt=2e-3,
+        num_steps=4000,
+        save_every=4,
     )
     for name, spin in spins.items()
 }
@@ -200,17 +241,19 @@ for name, run in tumble.items():
     print(f"{name:<8} angular momentum kept to {drift:.0e}, R orthogonal to {off:.0e}")
 
 # %% [markdown]
-# **Look at** the lines: about the axes of least and largest inertia the body spins steadily, the cosine stays where it
-# was; about the middle one it turns over. The reason lies in the equations, not in the method: angular momentum, which
-# nothing enforces, is kept to the figures printed above, and R stays orthogonal to rounding.
+# **Look at** the lines. About the axes of least and largest inertia the body spins steadily,
+# and the cosine stays constant. About the middle axis it turns over. This is a property of
+# the equations, not of the method. Nothing enforces the angular momentum, but it is kept to
+# the numbers printed above. R stays orthogonal to rounding.
 #
-# Mechanisms in space need no equations by hand: `hhtjax.bodies` makes them from bodies and joints, or from files. See
-# `hhtjax.scenes.body_chain`, rods on ball joints, and `hhtjax.scenes.arm`.
+# For mechanisms in space you need not write equations: `hhtjax.bodies` makes them from bodies
+# and joints, or from files. See `hhtjax.scenes.body_chain`, rods on ball joints, and
+# `hhtjax.scenes.arm`.
 #
 # ## What to try next
 #
-# * Let the left pivot of the linkage be 20 mm higher: how straight is the path of P now? `hhtjax.fit` can find the best
-#   place of a pivot, with the sideways motion as residual.
-# * Give a fourth bar to the linkage that changes nothing: the constraints then depend on each other, and the error says
-#   which. `hht(redundant="least_squares")` solves them all the same.
-# * Spin the book about its middle axis with exactly (0, 10, 0): why does it not tumble?
+# * Move the left pivot of the linkage 20 mm up. How straight is the path of P now?
+#   `hhtjax.fit` can find the best position of a pivot, with the sideways motion as residual.
+# * Add a fourth bar that does not change the motion. The constraints then depend on each
+#   other, and the error says which. `hht(redundant="least_squares")` solves them anyway.
+# * Spin the book about its middle axis with exactly (0, 10, 0). Why does it not tumble?

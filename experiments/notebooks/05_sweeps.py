@@ -1,9 +1,10 @@
 # %% [markdown]
 # # 5. Hundreds of runs in one call
 #
-# Step sizes, parameters, initial states and coefficients of the method are data: `hhtjax.sweep` runs any list of them
-# in one compiled call. Here: error against run time for three methods, a map of 600 members, the same on two devices,
-# and the same written to disk by parts.
+# `hhtjax.sweep` takes step sizes, parameters, initial states and coefficients of the method
+# as data, and runs any list of them in one compiled call. This notebook shows error against
+# run time for three methods, a map of 600 members, the same map on two devices, and the same
+# map written to disk in parts.
 
 # %%
 import json
@@ -22,13 +23,16 @@ import hhtjax
 
 jax.config.update("jax_enable_x64", True)
 plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
-jax.config.update("jax_num_cpu_devices", 2)  # before the first computation: split this processor into two "devices"
+jax.config.update(
+    "jax_num_cpu_devices", 2
+)  # before the first computation: split this processor into two "devices"
 
 # %% [markdown]
 # ## The scene
 #
-# A double pendulum with springs in both joints (`hhtjax.scenes.double_pendulum`, after Kim et al. 2019), let go from
-# the horizontal. The joints hold 20 N m/rad; later this becomes a parameter that differs between members.
+# A double pendulum has springs in both joints (`hhtjax.scenes.double_pendulum`, after Kim et
+# al. 2019). It is released from the horizontal. The joints have 20 N m/rad. Later this
+# parameter differs between members.
 
 # %%
 scene = hhtjax.scenes.double_pendulum.free()
@@ -37,11 +41,11 @@ start = scene.q0, scene.v0, params
 DURATION, SAMPLES = 1.0, 10
 
 # %% [markdown]
-# ## Error against time
+# ## Which error does a second of computing buy?
 #
-# What counts for a user is not the error at a step size but the error that a second of computing buys. `sweep` gives
-# the errors of all step sizes at once; then each member is timed alone. (Only the values of `dts` change, so nothing is
-# compiled again.)
+# The error at a step size matters less than the error after a given time of computing.
+# `sweep` gives the errors of all step sizes at once. Then each member is timed alone. (Only
+# the values of `dts` change, so nothing is compiled again.)
 
 # %%
 dts = jnp.geomspace(1e-4, 5e-2, 10)
@@ -49,7 +53,9 @@ methods = {"hht(-0.05)": hhtjax.hht(alpha=-0.05), "rowda": hhtjax.rowda(), "RK4"
 
 
 def run_all(stepper, dts):
-    return hhtjax.sweep(scene.system, stepper, *start, dts=dts, duration=DURATION, num_samples=SAMPLES)
+    return hhtjax.sweep(
+        scene.system, stepper, *start, dts=dts, duration=DURATION, num_samples=SAMPLES
+    )
 
 
 def seconds(function):
@@ -68,9 +74,17 @@ for name, stepper in methods.items():
     together, first = seconds(lambda stepper=stepper: run_all(stepper, dts))
     members = run_all(stepper, dts)
     error = np.sqrt(np.mean((np.asarray(members.q) - reference) ** 2, axis=(1, 2)))
-    alone = np.array([seconds(lambda dt=dt, stepper=stepper: run_all(stepper, dt[None]))[0] for dt in members.dt])
+    alone = np.array(
+        [
+            seconds(lambda dt=dt, stepper=stepper: run_all(stepper, dt[None]))[0]
+            for dt in members.dt
+        ]
+    )
     errors[name], curves[name] = (np.asarray(members.dt), error), (alone, error)
-    print(f"{name:<11} first call {first:.1f} s, with compiling; then all {len(dts)} runs {1e3 * together:.1f} ms")
+    print(
+        f"{name:<11} first call {first:.1f} s, with compiling; then all {len(dts)} runs "
+        f"{1e3 * together:.1f} ms"
+    )
 
 # %%
 figure, (left, right) = hhtjax.plot.subplots(1, 2, width=175, height=75)
@@ -80,15 +94,16 @@ right.get_legend().remove()
 plt.show()
 
 # %% [markdown]
-# **Look at** the right figure, from above: at a given error the curve farthest to the left is the cheapest. Nothing is
-# stiff in this scene, so the explicit method wins wherever many digits are asked for. On the very left all curves end
-# at the cost of a call, which no step size avoids.
+# **Look at** the right figure. At a given error, the curve farthest to the left is the
+# fastest. Nothing is stiff in this scene, so the explicit method is fastest if you need many
+# digits. On the far left all curves end at the cost of a call, which no step size avoids.
 #
 # ## A map of 600 members
 #
-# 20 step sizes times 30 stiffnesses of the second joint, from 1 to 10000 N m/rad. `in_axes` says what differs between
-# members, as for `jax.vmap`: the params have an axis of 600 in the leaf `k`, and nowhere else. The reference is a
-# second sweep with 30 members and a more accurate method.
+# The members are 20 step sizes times 30 stiffnesses of the second joint, from 1 to 10000 N
+# m/rad. `in_axes` says what differs between members, as in `jax.vmap`. Here only the leaf `k`
+# of the params has an axis of 600. The reference is a second sweep with 30 members and a more
+# accurate method.
 
 # %%
 steps, stiffness = jnp.geomspace(2e-4, 5e-2, 20), jnp.geomspace(1.0, 1e4, 30)
@@ -112,30 +127,45 @@ def many(**options):
 runs = many()
 runs.check()  # would name the first member that failed
 exact = hhtjax.sweep(
-    scene.system, hhtjax.rowda(), scene.q0, scene.v0, stiffened(stiffness), dts=jnp.full(30, 5e-5),
-    duration=DURATION, num_samples=SAMPLES, in_axes=AXES,
+    scene.system, hhtjax.rowda(), scene.q0, scene.v0, stiffened(stiffness),
+    dts=jnp.full(30, 5e-5), duration=DURATION, num_samples=SAMPLES, in_axes=AXES,
 )  # fmt: skip
-error = jnp.sqrt(jnp.mean((runs.q.reshape(20, 30, SAMPLES + 1, 2) - exact.q) ** 2, axis=(2, 3)))
+error = jnp.sqrt(
+    jnp.mean((runs.q.reshape(20, 30, SAMPLES + 1, 2) - exact.q) ** 2, axis=(2, 3))
+)
 total = float(jnp.sum(DURATION / runs.dt))
 print(f"{runs.q.shape[0]} members, {total:.2e} steps in one call")
 
 # %%
 figure, axes = hhtjax.plot.subplots(width=120, height=80)
-image = axes.pcolormesh(stiffness, 1e3 * steps, jnp.log10(error), cmap="viridis", shading="nearest")
+image = axes.pcolormesh(
+    stiffness, 1e3 * steps, jnp.log10(error), cmap="viridis", shading="nearest"
+)
 contours = axes.contour(
-    stiffness, 1e3 * steps, jnp.log10(error), levels=[-4, -3, -2, -1], colors="white", linestyles="solid"
+    stiffness,
+    1e3 * steps,
+    jnp.log10(error),
+    levels=[-4, -3, -2, -1],
+    colors="white",
+    linestyles="solid",
 )
 axes.clabel(contours, fmt=lambda x: f"$10^{{{x:.0f}}}$", fontsize=8)
-axes.set(xscale="log", yscale="log", xlabel="stiffness of the joint (N m/rad)", ylabel="step size (ms)")
+axes.set(
+    xscale="log",
+    yscale="log",
+    xlabel="stiffness of the joint (N m/rad)",
+    ylabel="step size (ms)",
+)
 figure.colorbar(image, label="log10 of the RMS error (rad)")
 plt.show()
 
 # %% [markdown]
-# **Look at** the white lines: along one, the error is the same. On the left they run level: there the swinging alone
-# sets the step size. Further to the right the joint vibrates faster, and the same error takes a smaller step; until, at
-# the top right, the vibration is so fast and so small that it costs little to leave it unresolved.
+# **Look at** the white lines of equal error. On the left they are level, because there the
+# swinging alone determines the step size. Further right the joint vibrates faster, and the
+# same error needs a smaller step. At the top right the vibration is so fast and so small that
+# leaving it unresolved costs little.
 #
-# Is the map honest? A member of the sweep is the run that `simulate` does, up to rounding:
+# Is the map right? A member of the sweep equals the run of `simulate`, up to rounding:
 
 # %%
 one = 250
@@ -144,26 +174,33 @@ alone = hhtjax.simulate(
     scene.system, hhtjax.hht(), scene.q0, scene.v0, params | {"k": (20.0, all_k[one])},
     dt=DURATION / n, num_steps=n, save_every=n // SAMPLES,
 )  # fmt: skip
-print(f"member {one}: {n} steps; largest difference {jnp.abs(alone.q - runs.q[one]).max():.0e} rad")
+print(
+    f"member {one}: {n} steps; largest difference "
+    f"{jnp.abs(alone.q - runs.q[one]).max():.0e} rad"
+)
 
 # %% [markdown]
 # ## Two devices
 #
-# Given a mesh of devices, members are dealt out among them. (Here the "devices" are halves of one processor; with other
-# work on it, do not expect half the time.)
+# With a mesh of devices, members are split between them. (Here the "devices" are halves of
+# one processor. If other programs use it, do not expect half the time.)
 
 # %%
 mesh = jax.make_mesh((2,), ("members",))
 one_device, two_devices = seconds(many)[0], seconds(lambda: many(mesh=mesh))[0]
 apart = np.abs(np.asarray(many(mesh=mesh).q) - np.asarray(runs.q)).max()
-print(f"one device {1e3 * one_device:.0f} ms, two {1e3 * two_devices:.0f} ms; largest difference {apart:.0e} rad")
+print(
+    f"one device {1e3 * one_device:.0f} ms, two {1e3 * two_devices:.0f} ms; largest "
+    f"difference {apart:.0e} rad"
+)
 assert apart < 1e-12
 
 # %% [markdown]
 # ## To disk, and on after an interruption
 #
-# For sweeps that take hours: `sweep_to_disk` writes chunks of members, each a file of its own. Here 3 of 200 members.
-# We delete the second, as if the machine had stopped there, and repeat the call: only what is missing is computed.
+# For sweeps that take hours, `sweep_to_disk` writes chunks of members, one file each. Here
+# there are 3 chunks of 200 members. We delete the second, as if the machine had stopped
+# there, and repeat the call. Only the missing chunk is computed.
 
 
 # %%
@@ -180,19 +217,27 @@ with tempfile.TemporaryDirectory() as temporary:
     written = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.npz")}
     (folder / "chunk-00001.npz").unlink()
     to_disk(folder)
-    again = [path.name for path in sorted(folder.glob("*.npz")) if path.stat().st_mtime_ns != written[path.name]]
+    again = [
+        path.name
+        for path in sorted(folder.glob("*.npz"))
+        if path.stat().st_mtime_ns != written[path.name]
+    ]
     print("computed again:", again)
     loaded = hhtjax.load_sweep(folder)
-    print("members in the manifest:", json.loads((folder / "manifest.json").read_text())["members"])
+    print(
+        "members in the manifest:",
+        json.loads((folder / "manifest.json").read_text())["members"],
+    )
 print("leaves:", ", ".join(sorted(loaded)))
 print("equal to the sweep in memory, to", float(np.abs(loaded["q"] - runs.q).max()), "rad")
 
 # %% [markdown]
-# ## By other processes
+# ## With other processes
 #
-# `executor=` hands the chunks to the workers of any executor of Python's standard library's kind. Here they are two
-# processes of this machine; on a cluster they are Dask's or MPI's. Workers are sent the compiled program, not the
-# functions of this notebook, so nothing has to be importable there. The files are the same, bit by bit.
+# `executor=` gives the chunks to the workers of any executor with the interface of Python's
+# standard library. Here the workers are two processes on this machine; on a cluster they can
+# be Dask's or MPI's. Workers receive the compiled program, not the functions of this
+# notebook, so nothing has to be importable there. The files are bitwise the same.
 
 # %%
 with tempfile.TemporaryDirectory() as temporary:
@@ -206,6 +251,9 @@ assert equal
 # %% [markdown]
 # ## What to try next
 #
-# * `times=` in place of `duration` and `num_samples`: samples at unequal times, as a logger leaves them.
-# * Let the coefficient of the method differ too: `jax.vmap(lambda a: hhtjax.hht(alpha=a))(alphas)` with the axis 0.
-# * `jax.grad` through a sweep: the derivative of all 600 errors in a parameter, at once.
+# * Use `times=` instead of `duration` and `num_samples`: samples at unequal times, as from a
+#   data logger.
+# * Let the coefficient of the method differ, too:
+#   `jax.vmap(lambda a: hhtjax.hht(alpha=a))(alphas)` with the axis 0.
+# * Use `jax.grad` through a sweep: the derivative of all 600 errors with respect to a
+#   parameter, at once.

@@ -1,9 +1,10 @@
 # %% [markdown]
 # # 6. Where methods fail
 #
-# No method with a fixed step is safe. This notebook makes them fail on purpose, so that you recognise it: runs that
-# blow up, runs that are wrong and look healthy, energy that disappears, ringing, and a motion that no method can
-# follow. For each: who notices, and what helps.
+# No method with a fixed step is safe. This notebook makes methods fail on purpose, so that
+# you recognise it. Runs blow up, or are wrong and look healthy. Energy disappears, forces
+# ring, and one motion cannot be followed by any method. For each failure we show who notices
+# it, and what helps.
 
 # %%
 import jax
@@ -21,8 +22,9 @@ plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 # %% [markdown]
 # ## Blown up, wrong, or fine
 #
-# Two scenes, six methods, steps that are halved ten times. A run is **fine** if the RMS error of q stays below 5 % of
-# the motion, **blown up** if it gets ten times as far from its start as the motion itself, and **wrong** in between.
+# There are two scenes, six methods, and steps that are halved ten times. A run is **fine** if
+# the RMS error of q is below 5 % of the motion. It is **blown up** if it gets ten times as
+# far from its start as the motion itself. Otherwise it is **wrong**. The scenes are
 #
 # * a mass on a spring that hardens strongly, $\ddot q = -100\,q - 10^4 q^3$, for 2 s,
 # * a damper that grows with the cube of the speed, $\ddot q = -q - 100\,\dot q^3$, for 20 s.
@@ -52,7 +54,9 @@ def grade(name, method):
     def sweep(stepper, counts):
         dts = duration / jnp.asarray(counts, float)
         return np.asarray(
-            hhtjax.sweep(system, stepper, q0, v0, params, dts=dts, duration=duration, num_samples=8).q[:, 1:]
+            hhtjax.sweep(
+                system, stepper, q0, v0, params, dts=dts, duration=duration, num_samples=8
+            ).q[:, 1:]
         )
 
     if name not in references:
@@ -60,13 +64,17 @@ def grade(name, method):
     exact, q = references[name], sweep(method, counts)
     reach = np.abs(exact - np.asarray(q0)).max()
     with np.errstate(all="ignore"):
-        error = np.sqrt(np.mean((q - exact) ** 2, axis=(1, 2))) / np.sqrt(np.mean((exact - exact.mean(axis=0)) ** 2))
+        error = np.sqrt(np.mean((q - exact) ** 2, axis=(1, 2))) / np.sqrt(
+            np.mean((exact - exact.mean(axis=0)) ** 2)
+        )
         farthest = np.abs(q - np.asarray(q0)).max(axis=(1, 2)) / reach
     return np.where(~(farthest < 10), 2, np.where(error < 0.05, 0, 1))
 
 
 references: dict = {}
-grades = {scene: np.array([grade(scene, method) for method in methods.values()]) for scene in scenes}
+grades = {
+    scene: np.array([grade(scene, method) for method in methods.values()]) for scene in scenes
+}
 
 # %%
 figure, axes = hhtjax.plot.subplots(1, 2, width=175, height=65, sharey=True)
@@ -88,16 +96,18 @@ for row, name in enumerate(methods):
     print(f"{name:<17} fine {fine:2d}, wrong {wrong:2d}, blown up {gone:2d} of {len(cells)}")
 
 # %% [markdown]
-# **Look at** the rows: the non-iterative step solves one linear system per step, and where it *linearises* decides what
-# it survives. `linearize="predictor"` is the smoothest and blows up first, "held" is bounded more often, and the
-# default picks one of the two at each step, by the residual. Newton's iteration, at several times the cost, turns runs
-# that blow up into runs that are wrong: compare the counts. Only smaller steps make runs fine.
+# **Look at** the rows. The non-iterative step solves one linear system per step. Where it
+# *linearises* decides which steps it can take. `linearize="predictor"` is the smoothest and
+# blows up first. "held" stays bounded more often. The default chooses one of the two in each
+# step, by the residual. Newton's iteration costs several times as much and turns runs that
+# blow up into runs that are wrong: compare the counts. Only smaller steps make runs fine.
 #
-# ## Who notices
+# ## Who notices?
 #
-# `check()` finds what is not finite, and what Newton could not solve. A run that is finite but absurd needs your
-# knowledge: how far can q get? And a run that is wrong but of the right size shows nothing. There only a second run
-# helps, and that is what `suggest_step_size` with a duration does.
+# `check()` reports what is not finite, and steps that Newton's iteration could not solve. If
+# a run is finite but absurd, you must say how far q can get. If a run is wrong but of the
+# right size, nothing shows it. Then only a second run helps. `suggest_step_size` with a
+# duration does this.
 
 # %%
 system, q0, v0, params, duration = scenes["hardening spring"]
@@ -110,7 +120,9 @@ for title, method, n, reach in (
     try:
         run.check(reach)
         graded = ("fine", "wrong", "blown up")[
-            grades["hardening spring"][list(methods.values()).index(method)][n.bit_length() - 4]
+            grades["hardening spring"][list(methods.values()).index(method)][
+                n.bit_length() - 4
+            ]
         ]
         print(f"{title}: silent; |q| up to {jnp.abs(run.q).max():.3g}, graded {graded}")
     except hhtjax.SimulationError as error:
@@ -123,8 +135,9 @@ print(f"advice for 5 %: dt = {advice.dt:.2g} s, that is {duration / advice.dt:.0
 # %% [markdown]
 # ## Energy that disappears
 #
-# Numerical damping is welcome for vibrations that nobody resolves, and a loss for those that matter. A dumbbell of two
-# masses on a stiff spring turns and vibrates freely, with 30 steps per vibration; nothing should be lost.
+# Numerical damping is welcome for vibrations that are not of interest. It is a loss for those
+# that matter. A dumbbell of two masses on a stiff spring turns and vibrates freely, with 30
+# steps per vibration. It should lose no energy.
 
 # %%
 dumbbell = hhtjax.System(
@@ -153,7 +166,10 @@ for i, (name, method) in enumerate(
     run = hhtjax.simulate(dumbbell, method, *start, dt=6.6e-3, num_steps=30000, save_every=100)
     energy = energy_of(run)
     axes.plot(run.t, energy, hhtjax.plot.LINES[i], label=name)
-    print(f"{name:<11} loses {100 * float(1 - energy[-1] / energy[0]):.2f} % of {energy[0]:.2f} J in 30000 steps")
+    print(
+        f"{name:<11} loses {100 * float(1 - energy[-1] / energy[0]):.2f} % of "
+        f"{energy[0]:.2f} J in 30000 steps"
+    )
 axes.set(xlabel="time (s)", ylabel="energy (J)")
 axes.legend()
 plt.show()
@@ -161,32 +177,42 @@ plt.show()
 # %% [markdown]
 # ## Ringing
 #
-# `alpha=0` damps nothing at all, not even a stiff vibration that a poor start or a jump excites, and that its step
-# cannot resolve: the acceleration then alternates from step to step for ever. Here the elastic pendulum of notebook 2
-# starts with its rod stretched too far by 0.1 mm.
+# `alpha=0` damps nothing. A poor start or a jump can excite a stiff vibration that the step
+# cannot resolve. Then the acceleration alternates from step to step for ever. Here the
+# elastic pendulum of notebook 2 starts with its rod stretched by 0.1 mm too much.
 
 # %%
 pendulum = hhtjax.scenes.pendulum.elastic(k=1e6)
 off = pendulum.q0 * (1 + 2e-4)
 figure, axes = hhtjax.plot.subplots(width=130, height=60)
 for alpha, line in ((0.0, "C1-"), (-0.05, "C0-"), (-0.3, "C2--")):
-    run = hhtjax.simulate(pendulum.system, hhtjax.hht(alpha), off, pendulum.v0, pendulum.params, dt=1e-2, num_steps=100)
+    run = hhtjax.simulate(
+        pendulum.system,
+        hhtjax.hht(alpha),
+        off,
+        pendulum.v0,
+        pendulum.params,
+        dt=1e-2,
+        num_steps=100,
+    )
     stretch = 1e6 * (jnp.sqrt(jnp.sum(run.q**2, axis=1)) - 0.5)
     axes.plot(run.t, stretch, line, lw=1, label=f"alpha = {alpha}")
     rough = float(jnp.std(jnp.diff(stretch[50:])))
     print(
-        f"alpha = {alpha:<5} force in the rod = {float(stretch[-1]):7.1f} N at the end; jumps by {rough:6.1f} N a step"
+        f"alpha = {alpha:<5} force in the rod = {float(stretch[-1]):7.1f} N at the end; "
+        f"jumps by {rough:6.1f} N a step"
     )
 axes.set(xlabel="time (s)", ylabel="force in the rod (N)")
 figure.legend(loc="outside upper center", ncols=3)
 plt.show()
 
 # %% [markdown]
-# ## What nobody can follow
+# ## What no method can follow
 #
-# The free double pendulum is **chaotic**: neighbouring motions part exponentially. Then the error of any method grows
-# exponentially too, and so does the derivative of the end in the start. Both are right, and both are useless after a
-# while: fit such motions over short windows (`hhtjax.windows`).
+# The free double pendulum is **chaotic**: neighbouring motions separate exponentially. So the
+# error of any method grows exponentially, and so does the derivative of the end with respect
+# to the start. Both are right, and both are useless after a while. Fit such motions over
+# short windows (`hhtjax.windows`).
 
 
 # %%
@@ -215,16 +241,18 @@ print(f"grows on average by a factor {np.exp(growth):.1f} each second")
 # %% [markdown]
 # ## Singular positions
 #
-# Constraints may come to depend on each other. Squares of hinged bars that lie flat could go on folded or unfolded;
-# their constraints do not say which, and the forces in the bars are not unique. You are told so, with the rows
-# concerned, before the run, or by `check()` where it happens on the way. `hht(redundant="least_squares")` takes the
-# smallest forces.
+# Constraints can become dependent during a motion. Squares of hinged bars that lie flat can
+# continue folded or unfolded. The constraints do not say which, and the forces in the bars
+# are not unique. An error names the rows concerned before the run, and `check()` does so if
+# it happens during the run. `hht(redundant="least_squares")` takes the smallest forces.
 
 # %%
 bars = hhtjax.scenes.four_bars.four_bars()
 flat = jnp.array([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
 try:
-    hhtjax.simulate(bars.system, hhtjax.hht(), flat, 0 * flat, bars.params, dt=1e-2, num_steps=10)
+    hhtjax.simulate(
+        bars.system, hhtjax.hht(), flat, 0 * flat, bars.params, dt=1e-2, num_steps=10
+    )
 except ValueError as error:
     print("ValueError:", error)
 
@@ -232,5 +260,5 @@ except ValueError as error:
 # ## What to try next
 #
 # * Repeat the gallery with `alpha=0.0` and with `alpha=-0.3`.
-# * All of this for 21 scenes and 14 methods: `python -m experiments stability`, and its page in
-#   `experiments/stability`.
+# * `python -m experiments stability` does all of this for more scenes and methods; see [its
+#   page](../stability/README.md).

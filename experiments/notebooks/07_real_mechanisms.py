@@ -1,8 +1,9 @@
 # %% [markdown]
 # # 7. Real mechanisms: friction, hysteresis, impacts
 #
-# Joints stick, rubber remembers, parts collide: dry friction that is set-valued, states that remember, and a contact
-# by a stiff force, with what that costs.
+# Joints stick, the force of rubber depends on the past, and parts collide. This notebook
+# shows set-valued dry friction, internal states, and a contact by a stiff force with its
+# cost.
 
 # %%
 import jax
@@ -18,16 +19,18 @@ plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 # %% [markdown]
 # ## Stick-slip: a mass on a moving belt
 #
-# A mass on a spring lies on a belt. It sticks and is carried along until the spring pulls harder than friction can
-# hold, slips back, and sticks again: so brakes squeal and violins sound. Friction is **set-valued**: while the mass
-# slides with the speed $s$ it is as large as its limit, which falls with the speed (Stribeck); while it sticks, it is
-# whatever keeps it there, up to that limit:
+# A mass on a spring lies on a moving belt. It sticks to the belt until the spring pulls
+# harder than friction can hold. Then it slips back and sticks again. Brakes squeal and
+# violins sound in the same way. Friction is **set-valued**. While the mass slides with speed
+# $s$, friction equals its limit, which falls with the speed (Stribeck). While the mass
+# sticks, friction takes any value up to that limit:
 #
 # $$\tau = F(s)\,\mathrm{sign}(s) \;\text{ if } s \ne 0, \quad |\tau| \le F(0) \;\text{ if } s = 0, \qquad
 # F(s) = F_k + (F_s - F_k)\,e^{-(s/v_s)^2}$$
 #
-# `System(mass, force, friction=limit, sliding=rates)` says just that: `limit` is $F$, never negative, and `sliding`
-# the velocity that is zero where the joint sticks (left out, it is $v$). There is no parameter of smoothness.
+# `System(mass, force, friction=limit, sliding=rates)` states this law. `limit` is $F$, which
+# must not be negative. `sliding` is the velocity that is zero while the joint sticks; its
+# default is $v$. There is no smoothing parameter.
 
 
 # %%
@@ -46,7 +49,9 @@ def limit(q, v, t, params):
 
 rubbing = hhtjax.System(jnp.ones(1), belt_force, friction=limit, sliding=sliding)
 params = {"k": 100.0, "Fk": 3.0, "Fs": 5.0, "vs": 0.05, "belt": 0.1}  # N/m, N, N, m/s, m/s
-run = hhtjax.simulate(rubbing, hhtjax.hht(), jnp.zeros(1), jnp.zeros(1), params, dt=5e-3, num_steps=1000)
+run = hhtjax.simulate(
+    rubbing, hhtjax.hht(), jnp.zeros(1), jnp.zeros(1), params, dt=5e-3, num_steps=1000
+)
 run.check()
 
 figure, (above, below) = hhtjax.plot.subplots(2, 1, width=175, height=85, sharex=True)
@@ -56,65 +61,106 @@ above.set_ylabel("position (mm)")
 below.plot(run.t, run.friction[:, 0], color="C1")
 below.set(xlabel="time (s)", ylabel="friction (N)")
 plt.show()
-print(f"after the first second it sticks for {100 * float(jnp.mean(run.sticking[200:, 0])):.0f} % of the time")
+print(
+    "after the first second it sticks for "
+    f"{100 * float(jnp.mean(run.sticking[200:, 0])):.0f} % of the time"
+)
 
 # %% [markdown]
-# **Look at** the dashed line: the stretch at which the spring pulls with $F_s$. While the mass sticks its position is
-# a straight line, and friction follows the spring. `run.friction` is $\tau$, `run.sticking` says where it sticks.
-# Each switch is resolved inside its step, with no step more and no iteration: `hht` stays of order 2 through all of
-# them.
+# **Look at** the dashed line. It is the stretch at which the spring pulls with $F_s$. While
+# the mass sticks, its position is a straight line and friction follows the spring.
+# `run.friction` is $\tau$, and `run.sticking` says where it sticks. Each switch is resolved
+# inside its step, without additional steps or iterations. `hht` keeps order 2 through all
+# switches.
 #
-# ## What smooth friction would cost
+# ## What would smooth friction cost?
 #
-# Elsewhere one takes $F \tanh(v/v_t)$, a very strong damper below $v_t$. It never quite sticks: load a block at rest
-# with 90 % of what friction can hold, and it creeps. And the smaller $v_t$, the smaller the step that follows it
-# through a reversal. The error below is that of a free vibration with dry friction, whose exact motion is known:
-# between reversals it is a cosine about $\pm F/k$.
+# A common replacement is $F \tanh(v/v_t)$, a very strong damper below $v_t$. It never sticks
+# completely: a block at rest creeps under a load of 90 % of what friction can hold. A smaller
+# $v_t$ creeps less, but then a reversal needs smaller steps. The error below is that of a
+# free vibration with dry friction. Its exact motion is known: between reversals it is a
+# cosine about $\pm F/k$.
 
 # %%
 zero = jnp.zeros(1)
-still = hhtjax.System(jnp.ones(1), lambda q, v, t, p: p["load"] + 0 * q, friction=lambda q, v, t, p: p["F"] + 0 * q)
-held = hhtjax.simulate(still, hhtjax.hht(), zero, zero, {"load": 3.6, "F": 4.0}, dt=1e-2, num_steps=1000)
+still = hhtjax.System(
+    jnp.ones(1),
+    lambda q, v, t, p: p["load"] + 0 * q,
+    friction=lambda q, v, t, p: p["F"] + 0 * q,
+)
+held = hhtjax.simulate(
+    still, hhtjax.hht(), zero, zero, {"load": 3.6, "F": 4.0}, dt=1e-2, num_steps=1000
+)
 print(f"set-valued: moves {float(held.q[-1, 0])} m in 10 s")
-block = hhtjax.System(jnp.ones(1), lambda q, v, t, p: p["load"] - p["F"] * jnp.tanh(v / p["vt"]))
+block = hhtjax.System(
+    jnp.ones(1), lambda q, v, t, p: p["load"] - p["F"] * jnp.tanh(v / p["vt"])
+)
 stepper = hhtjax.hht(linearize="state")  # the best one with such dampers
 for vt in (1e-2, 1e-3, 1e-4):
     rest = zero, zero, {"load": 3.6, "F": 4.0, "vt": vt}
-    moved = hhtjax.simulate(block, stepper, *rest, dt=1e-2, num_steps=1000, save_every=1000).q[-1, 0]
+    moved = hhtjax.simulate(block, stepper, *rest, dt=1e-2, num_steps=1000, save_every=1000).q[
+        -1, 0
+    ]
     print(f"tanh, vt = {vt:.0e} m/s: creeps {1e3 * moved:7.3f} mm in 10 s")
 
 
 def exact(t):
-    """k = 100, m = 1, F = 4, from 0.5 m: each half period the amplitude falls by 2 F/k = 0.08 m."""
+    """k = 100, m = 1, F = 4, from 0.5 m.
+
+    The amplitude falls by 2 F/k = 0.08 m each half period."""
     half = np.floor(10 * t / np.pi)
     centre = np.where(half % 2 == 0, 0.04, -0.04)
     return centre + (0.5 - 0.04 - 0.08 * half) * np.cos(10 * t)
 
 
-dry = hhtjax.System(jnp.ones(1), lambda q, v, t, p: -100.0 * q, friction=lambda q, v, t, p: 4.0 + 0 * q)
+dry = hhtjax.System(
+    jnp.ones(1), lambda q, v, t, p: -100.0 * q, friction=lambda q, v, t, p: 4.0 + 0 * q
+)
 smooth = hhtjax.System(jnp.ones(1), lambda q, v, t, p: -100.0 * q - 4.0 * jnp.tanh(v / p))
 laws = {"set-valued": (dry, hhtjax.hht(), None)}
-laws |= {f"tanh, vt = {vt:g} m/s": (smooth, stepper, jnp.asarray(vt)) for vt in (1e-1, 1e-2, 1e-3)}
+laws |= {
+    f"tanh, vt = {vt:g} m/s": (smooth, stepper, jnp.asarray(vt)) for vt in (1e-1, 1e-2, 1e-3)
+}
 counts = np.array([150, 300, 600, 1200, 2400, 4800, 9600])
 curves = {}
 for name, (system, method, p) in laws.items():
-    sweep = hhtjax.sweep(system, method, jnp.array([0.5]), zero, p, dts=1.5 / counts, duration=1.5, num_samples=75)
+    sweep = hhtjax.sweep(
+        system,
+        method,
+        jnp.array([0.5]),
+        zero,
+        p,
+        dts=1.5 / counts,
+        duration=1.5,
+        num_samples=75,
+    )
     error = np.abs(np.asarray(sweep.q[:, :, 0]) - exact(np.asarray(sweep.t))).max(axis=1)
     curves[name] = np.asarray(sweep.dt), error
 figure, axes = hhtjax.plot.subplots(width=130, height=75)
 for i, (name, (dt, error)) in enumerate(curves.items()):
-    axes.loglog(dt, error, marker=hhtjax.plot.MARKERS[i], ls=hhtjax.plot.LINES[i % len(hhtjax.plot.LINES)], label=name)
+    axes.loglog(
+        dt,
+        error,
+        marker=hhtjax.plot.MARKERS[i],
+        ls=hhtjax.plot.LINES[i % len(hhtjax.plot.LINES)],
+        label=name,
+    )
 axes.set(xlabel="step size (s)", ylabel="largest error of the position (m)")
 axes.legend()
 plt.show()
 for name, (_, error) in curves.items():
-    print(f"{name}: error {1e3 * error[0]:.2g} mm with {counts[0]} steps, {1e3 * error[-1]:.2g} mm with {counts[-1]}")
+    print(
+        f"{name}: error {1e3 * error[0]:.2g} mm with {counts[0]} steps, "
+        f"{1e3 * error[-1]:.2g} mm with {counts[-1]}"
+    )
 
 # %% [markdown]
-# **Look at** the floors on the left: there the error is no longer the step's but the stand-in's. The set-valued line
-# falls as $h^2$. Friction of several joints, with constraints and rotations, and limits that depend on a normal load
-# are in the documentation of `System`; [dry friction](../friction/README.md) compares with MuJoCo, and
-# [identification](../identification/README.md) fits the friction of a measured axis (EMPS).
+# **Look at** the left ends of the curves. There the error no longer depends on the step: it
+# is the error of the smooth law. The set-valued line falls as $h^2$. The documentation of
+# `System` explains friction of several joints, with constraints and rotations, and limits
+# that depend on a normal load. [Dry friction](../friction/README.md) compares with MuJoCo and
+# exudyn. [Identification](../identification/README.md) fits the friction of a measured axis
+# (EMPS).
 #
 # ## Hysteresis: a state that remembers
 #
@@ -164,9 +210,10 @@ print(f"the hysteresis takes {1e3 * eaten:.0f} mJ out of the last cycle, the dam
 #
 # ## A bouncing ball: a stiff contact
 #
-# A ball falls on a plate that pushes back with $k\,\delta\,(1 + c\,\dot\delta)$ at the depth $\delta$ (Hunt and
-# Crossley): a spring, and losses that vanish where the contact ends. The contact lasts some milliseconds, and the
-# step has to resolve it.
+# A ball falls on a plate. At the depth $\delta$ the plate pushes back with
+# $k\,\delta\,(1 + c\,\dot\delta)$ (Hunt and Crossley). This is a spring with losses that
+# vanish at the end of the contact. The contact lasts some milliseconds, and the step must
+# resolve it.
 
 
 # %%
@@ -192,16 +239,21 @@ plt.show()
 height, speed = np.asarray(bounce.q[:, 0]), np.asarray(bounce.v[:, 0])
 touching = np.sum(height[2000:2600] < 0) * 0.2  # ms
 tops = height[:-1][(speed[:-1] > 0) & (speed[1:] <= 0)]
-print(f"the first contact lasts {touching:.1f} ms; tops of the first jumps {', '.join(f'{x:.3f}' for x in tops[:4])} m")
+print(
+    f"the first contact lasts {touching:.1f} ms; tops of the first jumps "
+    f"{', '.join(f'{x:.3f}' for x in tops[:4])} m"
+)
 print(f"restitution at the first impact, from the tops: {np.sqrt(tops[0]):.3f}")
 
 # %% [markdown]
-# How many steps does a contact need? All step sizes in one sweep, and the height 0.8 s after the start, well after
-# the first impact:
+# How many steps does a contact need? One sweep runs all step sizes. We compare the height 0.8
+# s after the start, well after the first impact:
 
 # %%
 dts = jnp.geomspace(2e-5, 5e-3, 25)
-heights = hhtjax.sweep(ball, hhtjax.hht(), high, still, thrown, dts=dts, duration=0.8, num_samples=1)
+heights = hhtjax.sweep(
+    ball, hhtjax.hht(), high, still, thrown, dts=dts, duration=0.8, num_samples=1
+)
 off = jnp.abs(heights.q[1:, -1, 0] - heights.q[0, -1, 0])
 per_contact = touching / 1e3 / heights.dt[1:]
 figure, axes = hhtjax.plot.subplots(width=120, height=60)
@@ -213,13 +265,16 @@ for wanted in (4, 20, 100):
     print(f"{float(per_contact[i]):5.0f} steps per contact: {1e3 * float(off[i]):8.3f} mm off")
 
 # %% [markdown]
-# The error falls, but not along a clean line: a step that straddles the beginning or the end of a contact loses its
-# order, and where they fall changes with the step. Locating the impact within the step mends that. Such **events**,
-# `simulate(..., events=[Event(guard, reset=impact(e))])`, have a restitution coefficient instead of a stiffness,
-# and keep the order of the method: they are on a page of their own, [events](../events/README.md).
+# The error falls, but not along a straight line. A step that contains the beginning or the
+# end of a contact loses its order, and where these fall changes with the step. To keep the
+# order, locate the impact within the step:
+# `simulate(..., events=[Event(guard, reset=impact(e))])`. Such **events** have a coefficient
+# of restitution instead of a stiffness. See [events](../events/README.md). For contacts that
+# also rest, stick and slide see [contact](../contact/README.md).
 #
 # ## What to try next
 #
 # * Fit `Fs`, `Fk` and `vs` of the belt from a noisy run, as in notebook 3.
-# * Let the frequency of the mount be 30 Hz, closer to its resonance: what becomes of the loops?
-# * Drop the ball with `hht(alpha=0.0)`: is the energy after an impact always less than before?
+# * Set the frequency of the mount to 30 Hz, closer to its resonance. How do the loops change?
+# * Drop the ball with `hht(alpha=0.0)`. Is the energy after an impact always less than
+#   before?

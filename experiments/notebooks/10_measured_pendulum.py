@@ -1,13 +1,14 @@
 # %% [markdown]
 # # 10. A measured double pendulum
 #
-# A camera followed the two arms of a double pendulum (Schmidt and Lipson 2009): angles at about 100 Hz, with gaps, no
-# input, and a motion that is chaotic when it is large. We find inertia, weights and friction, from **short windows** of
-# the record, each with an initial state of its own.
+# A camera followed the two arms of a double pendulum (Schmidt and Lipson 2009). The record
+# has angles at about 100 Hz, with gaps and without an input. The motion is chaotic when it is
+# large. We estimate inertia, weights and friction from **short windows** of the record, each
+# with its own initial state.
 #
-# The file real_double_pend_h_1.txt belongs to the paper's supplementary data. Put it into a folder `double_pendulum/`,
-# and let `HHTJAX_DATA` name the folder that holds it. Without it, the notebook makes a record of the same kind, and
-# says so.
+# The file real_double_pend_h_1.txt belongs to the supplementary data of the paper. Put it
+# into a folder `double_pendulum/`, and set `HHTJAX_DATA` to the folder that contains it.
+# Without it, the notebook generates a record of the same kind, and says so.
 
 # %%
 import os
@@ -24,25 +25,35 @@ from hhtjax.identification import wrap_angle
 jax.config.update("jax_enable_x64", True)
 plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 
-file = Path(os.environ.get("HHTJAX_DATA", ".")) / "double_pendulum" / "real_double_pend_h_1.txt"
+file = (
+    Path(os.environ.get("HHTJAX_DATA", ".")) / "double_pendulum" / "real_double_pend_h_1.txt"
+)
 measured = file.is_file()
-print("MEASURED (Schmidt and Lipson 2009)" if measured else f"GENERATED, known parameters; {file} is not there")
+print(
+    "MEASURED (Schmidt and Lipson 2009)"
+    if measured
+    else f"GENERATED, known parameters; {file} is not there"
+)
 
 # %% [markdown]
 # ## The model
 #
-# Both angles are measured from the downward vertical. Divided by the inertia of the first arm,
+# Both angles are measured from the downward vertical. Divided by the inertia of the first
+# arm, the mass matrix is
 #
 # $$M = \begin{pmatrix} 1 & B\cos(q_1 - q_2)\\ \cdot & A\end{pmatrix}$$
 #
-# and the forces are weights $g_1 \sin q_1$, $g_2 \sin q_2$, the terms that go with $M$, and viscous friction in both
-# joints. Only these ratios can be found from angles alone. A dictionary of parameters, two of them arrays:
+# The forces are weights $g_1 \sin q_1$ and $g_2 \sin q_2$, the velocity terms that belong to
+# $M$, and viscous friction in both joints. Angles alone determine only these ratios. The
+# parameters are a dictionary; two of them are arrays:
 
 
 # %%
 def mass(q, p):
     coupling = p["B"] * jnp.cos(q[0] - q[1])
-    return jnp.stack([jnp.stack([jnp.ones_like(coupling), coupling]), jnp.stack([coupling, p["A"]])])
+    return jnp.stack(
+        [jnp.stack([jnp.ones_like(coupling), coupling]), jnp.stack([coupling, p["A"]])]
+    )
 
 
 def force(q, v, t, p):
@@ -62,7 +73,12 @@ def simulate(params, q0, v0, num_steps):
     return hhtjax.simulate(pendulum, stepper, q0, v0, params, dt=DT, num_steps=num_steps)
 
 
-TRUE = {"A": 0.28, "B": 0.26, "g": jnp.array([65.0, 17.0]), "friction": jnp.array([0.02, 0.01])}
+TRUE = {
+    "A": 0.28,
+    "B": 0.26,
+    "g": jnp.array([65.0, 17.0]),
+    "friction": jnp.array([0.02, 0.01]),
+}
 if measured:
     table = np.genfromtxt(file, comments="%")
     table = table[table[:, 0] == 0]  # the first of two trials
@@ -71,21 +87,28 @@ else:
     rng = np.random.default_rng(0)
     t = np.cumsum(np.where(rng.random(800) < 0.02, 0.1, 0.01))
     t -= t[0]
-    run = simulate(TRUE, jnp.array([-1.1, -1.3]), jnp.array([0.0, -6.0]), int(np.ceil(t[-1] / DT)))
+    run = simulate(
+        TRUE, jnp.array([-1.1, -1.3]), jnp.array([0.0, -6.0]), int(np.ceil(t[-1] / DT))
+    )
     dense = hhtjax.interpolate(run, t)
     angle = np.asarray(dense.q) + 1.2e-3 * rng.normal(size=(800, 2)) - [0.01, -0.02]
     rates = np.asarray(dense.v) + 0.05 * rng.normal(size=(800, 2))
-print(f"{len(t)} samples in {t[-1]:.1f} s, {1e3 * np.diff(t).min():.1f} to {1e3 * np.diff(t).max():.0f} ms apart")
+print(
+    f"{len(t)} samples in {t[-1]:.1f} s, {1e3 * np.diff(t).min():.1f} to "
+    f"{1e3 * np.diff(t).max():.0f} ms apart"
+)
 
 # %% [markdown]
 # ## Windows
 #
-# Over a few seconds the derivative of a chaotic motion in its parameters explodes (notebook 6), and a fit over the
-# whole record gets lost. `windows` cuts it into pieces of equal duration; they follow the clock, so gaps do not matter.
-# The initial state of each piece is fitted along (`starts=`), and eliminated: the Jacobian stays small however many
-# windows. `interpolate` takes the run to the times of the samples.
+# Over a few seconds the derivative of a chaotic motion with respect to its parameters becomes
+# huge (notebook 6), and a fit over the whole record fails. `windows` cuts the record into
+# pieces of equal duration. It uses the time stamps, so gaps do not matter. The initial state
+# of each piece is fitted as well (`starts=`) and then eliminated. So the Jacobian stays small
+# for any number of windows. `interpolate` evaluates the run at the times of the samples.
 #
-# The tracker's zero may be off by a small angle: `offset`, two more unknowns.
+# The zero of the camera may be wrong by a small angle. `offset` adds two more unknowns for
+# this.
 
 
 # %%
@@ -101,13 +124,19 @@ def fit_windows(duration, params0, at_start, **options):
     starts = {"q": jnp.asarray(angle[first]), "v": jnp.asarray(at_start[first])}
     positive = {name: hhtjax.positive if name in ("A", "B", "g") else None for name in params0}
     result = hhtjax.fit(
-        residuals, params0, records=jax.tree.map(jnp.asarray, records), starts=starts, transforms=positive,
-        weights=jnp.asarray(records.present, float), **options,
+        residuals, params0, records=jax.tree.map(jnp.asarray, records), starts=starts,
+        transforms=positive, weights=jnp.asarray(records.present, float), **options,
     )  # fmt: skip
     return result, records
 
 
-guess = {"A": 0.5, "B": 0.3, "g": jnp.array([40.0, 30.0]), "friction": jnp.array([0.1, 0.1]), "offset": jnp.zeros(2)}
+guess = {
+    "A": 0.5,
+    "B": 0.3,
+    "g": jnp.array([40.0, 30.0]),
+    "friction": jnp.array([0.1, 0.1]),
+    "offset": jnp.zeros(2),
+}
 short, records = fit_windows(0.25, guess, rates, covariance=False)
 result, records = fit_windows(0.5, short.params, rates)
 print(f"{len(records.begin)} windows of 0.5 s\n")
@@ -122,9 +151,9 @@ if not measured:
 # %% [markdown]
 # ## One window, and all residuals
 #
-# **Look at** the left for what is fitted, and at the right for what is left of it. Residuals that rise and fall
-# together are the model's own error (the joints' friction is hardly viscous, the arms are not rigid); scatter would be
-# noise.
+# **Look at** the fit on the left, and at the residuals on the right. Residuals that rise and
+# fall together are the error of the model: the friction of the joints is hardly viscous, and
+# the arms are not rigid. Noise would be scatter.
 
 # %%
 k = int(np.argmax(np.ptp(records.y[:, :, 0], axis=1)))
@@ -133,7 +162,13 @@ run = simulate(result.params, result.starts["q"][k], result.starts["v"][k], int(
 figure, (left, right) = hhtjax.plot.subplots(1, 2, width=175, height=70)
 for i in range(2):
     left.plot(
-        records.t[k][here], records.y[k][here, i], "os"[i], color=f"C{i}", ms=4, mfc="none", label=f"angle {i + 1}"
+        records.t[k][here],
+        records.y[k][here, i],
+        "os"[i],
+        color=f"C{i}",
+        ms=4,
+        mfc="none",
+        label=f"angle {i + 1}",
     )
     left.plot(run.t, run.q[:, i] - result.params["offset"][i], color=f"C{i}", lw=1.2)
     right.plot((records.begin[:, None] + records.t)[records.present[:, :, i]],
@@ -148,34 +183,49 @@ plt.show()
 # %% [markdown]
 # ## How long can it predict?
 #
-# The same parameters over longer and longer windows, with the initial state as fitted at the beginning: the error grows
-# as neighbouring motions part.
+# The same parameters predict longer and longer windows, from the fitted initial state. The
+# error grows because neighbouring motions separate.
 
 # %%
 every = np.arange(0, len(records.begin), 2)
 horizon = 4.0
 inside = every[records.begin[every] + horizon < t[-1]]
 ahead = jax.jit(
-    jax.vmap(lambda q, v: simulate(result.params, q, v, int(horizon / DT)).q[:: int(0.02 / DT)])
-)(result.starts["q"][inside], result.starts["v"][inside])  # fmt: skip
+    jax.vmap(
+        lambda q, v: simulate(result.params, q, v, int(horizon / DT)).q[:: int(0.02 / DT)]
+    )
+)(result.starts["q"][inside], result.starts["v"][inside])
 grid = np.arange(ahead.shape[1]) * 0.02
 gone = []
 for path, begin in zip(np.asarray(ahead), records.begin[inside], strict=True):
-    seen = np.stack([np.interp(begin + grid, t, np.unwrap(angle[:, i])) for i in range(2)], axis=1)
-    gone.append(np.abs(np.asarray(wrap_angle(path - np.asarray(result.params["offset"]) - seen))).max(axis=1))
+    seen = np.stack(
+        [np.interp(begin + grid, t, np.unwrap(angle[:, i])) for i in range(2)], axis=1
+    )
+    gone.append(
+        np.abs(np.asarray(wrap_angle(path - np.asarray(result.params["offset"]) - seen))).max(
+            axis=1
+        )
+    )
 figure, axes = hhtjax.plot.subplots(width=130, height=60)
 axes.semilogy(grid[1:], 1e3 * np.median(gone, axis=0)[1:], label="median of the windows")
 axes.semilogy(grid[1:], 1e3 * np.max(gone, axis=0)[1:], "--", label="worst")
 axes.axvline(0.5, color="black", ls=":", lw=1)
-axes.set(xlabel="time since the beginning of the window (s)", ylabel="largest error of the angles (mrad)")
+axes.set(
+    xlabel="time since the beginning of the window (s)",
+    ylabel="largest error of the angles (mrad)",
+)
 axes.legend()
 plt.show()
-print(f"median error after 0.5 s: {1e3 * np.median(gone, axis=0)[25]:.1f} mrad, after {horizon:.0f} s: "
-      f"{1e3 * np.median(gone, axis=0)[-1]:.0f} mrad")  # fmt: skip
+print(
+    f"median error after 0.5 s: {1e3 * np.median(gone, axis=0)[25]:.1f} mrad, "
+    f"after {horizon:.0f} s: {1e3 * np.median(gone, axis=0)[-1]:.0f} mrad"
+)
 
 # %% [markdown]
 # ## What to try next
 #
-# * Add dry friction, `d * jnp.tanh(v / 0.1)`, in both joints: does the error fall?
-# * Windows of 2 s at once from `guess`, and step by step with `hhtjax.fit_progressively`: which arrives?
-# * The full study, with held-out parts and an unseen trial: `python -m experiments double_pendulum_measured`.
+# * Add dry friction, `d * jnp.tanh(v / 0.1)`, in both joints. Does the error fall?
+# * Fit windows of 2 s at once from `guess`, and step by step with `hhtjax.fit_progressively`.
+#   Which one arrives?
+# * For the full study, with held-out parts and an unseen trial, run
+#   `python -m experiments double_pendulum_measured`.

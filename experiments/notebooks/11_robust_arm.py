@@ -1,9 +1,10 @@
 # %% [markdown]
 # # 11. A robot arm from noisy data with outliers
 #
-# A few wrong samples, from an encoder that slips or a cable that loses contact, spoil a least-squares fit: the square
-# lets the worst samples rule. A **robust loss** grows more slowly for large residuals. Here the joints of an arm of
-# three links are identified from a record in which every twentieth sample is wrong.
+# An encoder that slips or a cable that loses contact gives a few wrong samples. They spoil a
+# least-squares fit, because the square gives the worst samples the most weight. A **robust
+# loss** grows more slowly for large residuals. Here we identify the joints of an arm with
+# three links from a record in which every twentieth sample is wrong.
 
 # %%
 import jax
@@ -19,10 +20,11 @@ plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 # %% [markdown]
 # ## The arm and its record
 #
-# `hhtjax.scenes.arm` is an open chain of rigid links; masses and lengths are known, from drawings, say. Each joint has
-# a spring (the gear and its position controller) and a damper: six unknowns. The arm is let go from a bent pose and
-# recorded for 1.5 s: 300 samples of three angles, with noise of 2 mrad. Then 5 % of them are replaced by something up
-# to 0.3 rad off.
+# `hhtjax.scenes.arm` is an open chain of rigid links. Masses and lengths are known, for
+# example from drawings. Each joint has a spring (the gear and its position controller) and a
+# damper, so there are six unknowns. The arm is released from a bent pose and recorded for 1.5
+# s: 300 samples of three angles, with noise of 2 mrad. Then 5 % of the samples are replaced
+# by values that are wrong by up to 0.3 rad.
 
 # %%
 arm = hhtjax.scenes.arm.swing(joints=3)
@@ -33,7 +35,14 @@ NOISE, SAMPLES = 2e-3, 300
 def angles(unknown):
     stepper = hhtjax.hht(alpha=-0.05, linearize="predictor")
     run = hhtjax.simulate(
-        arm.system, stepper, arm.q0, arm.v0, arm.params | unknown, dt=2.5e-3, num_steps=2 * SAMPLES, save_every=2
+        arm.system,
+        stepper,
+        arm.q0,
+        arm.v0,
+        arm.params | unknown,
+        dt=2.5e-3,
+        num_steps=2 * SAMPLES,
+        save_every=2,
     )
     return run.q[1:]
 
@@ -48,10 +57,11 @@ print(f"{spoiled.sum()} of {record.size} samples are wrong")
 # %% [markdown]
 # ## Two fits
 #
-# `weights` is one over the standard deviation of the noise: a robust loss bends where residual times weight is about 1,
-# so it has to know what is normal. "cauchy" grows only like a logarithm, and forgets the worst samples nearly
-# altogether; "huber" and "soft_l1", milder, grow like the size of the residual. `positive` keeps stiffness and damping
-# above zero.
+# `weights` is one over the standard deviation of the noise. A robust loss changes its shape
+# where residual times weight is about 1, so it must know the usual size of the residuals.
+# "cauchy" grows only like a logarithm and almost ignores the worst samples. "huber" and
+# "soft_l1" are milder and grow like the size of the residual. `positive` keeps stiffness and
+# damping above zero.
 
 
 # %%
@@ -63,7 +73,11 @@ guess = jax.tree.map(lambda x: jnp.full(3, jnp.mean(x)), true)
 positive = {"stiffness": hhtjax.positive, "damping": hhtjax.positive}
 fits = {
     str(loss or "least squares"): hhtjax.fit(
-        residuals, guess, loss=loss, weights=jnp.full(record.shape, 1 / NOISE), transforms=positive
+        residuals,
+        guess,
+        loss=loss,
+        weights=jnp.full(record.shape, 1 / NOISE),
+        transforms=positive,
     )
     for loss in (None, "cauchy")
 }
@@ -74,8 +88,9 @@ print()
 print(fits["cauchy"].summary())
 
 # %% [markdown]
-# **Look at** how far the intervals of each fit are from zero, the truth, and how wide they are. An interval should
-# reach zero in 19 of 20 cases. The samples that do it are the grey dots off the line, on the right.
+# **Look at** the distance of the intervals of each fit from zero, the truth, and at their
+# width. An interval should contain zero in 19 of 20 cases. The grey dots off the line, on the
+# right, are the wrong samples.
 
 # %%
 figure, (left, right) = hhtjax.plot.subplots(1, 2, width=175, height=85, width_ratios=(3, 2))
@@ -90,27 +105,35 @@ plt.show()
 # %% [markdown]
 # ## Which samples were wrong?
 #
-# The residuals of the robust fit tell: what is farther off than five standard deviations of the noise.
+# The residuals of the robust fit show them: those larger than five standard deviations of the
+# noise.
 
 # %%
 flagged = np.abs(np.asarray(fits["cauchy"].residual)) > 5 * NOISE
 visible = spoiled & (np.abs(record - clean) > 6 * NOISE)
 print(f"flagged: {flagged.sum()}, of which were right after all: {np.sum(flagged & ~spoiled)}")
-print(f"of {visible.sum()} samples that are off by more than six deviations, found: {np.sum(flagged & visible)}")
+print(
+    f"of {visible.sum()} samples that are off by more than six deviations, found: "
+    f"{np.sum(flagged & visible)}"
+)
 
 # %% [markdown]
-# They can be left out (`weights=` with zeros) and the rest fitted by least squares, which makes the best use of good
-# data:
+# Leave them out (`weights=` with zeros) and fit the rest by least squares. This makes the
+# best use of good data:
 
 # %%
 good = jnp.where(flagged, 0.0, 1 / NOISE)
 last = hhtjax.fit(residuals, fits["cauchy"].params, weights=good, transforms=positive)
-off = {x: np.round(np.asarray((last.params[x] - true[x]) / last.standard_errors[x]), 1) for x in true}
+off = {
+    x: np.round(np.asarray((last.params[x] - true[x]) / last.standard_errors[x]), 1)
+    for x in true
+}
 print("off by", off, "standard errors")
 
 # %% [markdown]
 # ## What to try next
 #
-# * Half of the samples wrong: which loss still finds the joints?
-# * Let the mass of the last link be unknown too: can stiffness and mass be told apart? `summary()` names what cannot.
-# * A start far away, and `hhtjax.multistart`.
+# * Make half of the samples wrong. Which loss still finds the joints?
+# * Let the mass of the last link be unknown, too. Can the data distinguish stiffness and
+#   mass? `summary()` names what they cannot.
+# * Start far away, and use `hhtjax.multistart`.

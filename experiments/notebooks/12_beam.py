@@ -1,9 +1,9 @@
 # %% [markdown]
 # # 12. A beam with 200 degrees of freedom
 #
-# Beams, chains and frames have many unknowns, each coupled to a few neighbours only. Two ways to use that: a
-# `LinearSystem`, whose matrix is factorised once for the whole run; and, where something nonlinear happens, a solver
-# that knows of the **bands** of the matrix.
+# Beams, chains and frames have many unknowns, each coupled only to a few neighbours. There
+# are two ways to use this. A `LinearSystem` factorises its matrix once for the whole run. For
+# nonlinear systems, a solver can use the **bands** of the matrix.
 
 # %%
 import time
@@ -21,8 +21,9 @@ plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
 # %% [markdown]
 # ## The beam
 #
-# A steel strip, 1 m long, 30 mm wide and 3 mm thick, simply supported at both ends. $\rho A\,\ddot w + EI\,w'''' = f$,
-# by finite differences at 200 places inside: the second difference twice. Its mass matrix is a diagonal.
+# A steel strip is 1 m long, 30 mm wide and 3 mm thick, and simply supported at both ends. Its
+# equation is $\rho A\,\ddot w + EI\,w'''' = f$. We use finite differences at 200 interior
+# points: the second difference twice. The mass matrix is a diagonal.
 
 # %%
 N, LENGTH = 200, 1.0
@@ -33,18 +34,28 @@ D2 = (np.eye(N, k=1) - 2 * np.eye(N) + np.eye(N, k=-1)) / dx**2
 K = EI * dx * D2 @ D2
 M = np.full(N, rhoA * dx)
 C = 1e-5 * K  # damping in proportion to the stiffness
-print(f"entries of K that are not zero: {np.count_nonzero(K)} of {K.size}, in {2 * 2 + 1} bands")
+print(
+    f"entries of K that are not zero: {np.count_nonzero(K)} of {K.size}, in {2 * 2 + 1} bands"
+)
 
 exact = (np.arange(1, 4) * np.pi / LENGTH) ** 2 * np.sqrt(EI / rhoA)
 found = np.sqrt(np.sort(np.linalg.eigvalsh(K / M[0])))
-print("first frequencies (Hz):", np.round(found[:3] / 2 / np.pi, 3), " by theory:", np.round(exact / 2 / np.pi, 3))
-print(f"highest: {found[-1] / 2 / np.pi:.0f} Hz. An explicit method would need steps below {2.8 / found[-1]:.1e} s")
+print(
+    "first frequencies (Hz):",
+    np.round(found[:3] / 2 / np.pi, 3),
+    " by theory:",
+    np.round(exact / 2 / np.pi, 3),
+)
+print(
+    f"highest: {found[-1] / 2 / np.pi:.0f} Hz. An explicit method would need steps below "
+    f"{2.8 / found[-1]:.1e} s"
+)
 
 # %% [markdown]
 # ## Struck with a hammer: linear
 #
-# A half-sine blow of 1 ms at a quarter of the length. The step, 0.2 ms, resolves the first modes; the highest ones are
-# damped by the method (`alpha=-0.1`) instead of being resolved.
+# The blow is a half sine of 1 ms at a quarter of the length. The step of 0.2 ms resolves the
+# first modes. The highest modes are not resolved; the method damps them (`alpha=-0.1`).
 
 # %%
 DT, STEPS = 2e-4, 2500
@@ -64,7 +75,9 @@ def timed(system, stepper, params):
     """A run, and microseconds per step of a second call."""
     for _ in range(2):
         begin = time.perf_counter()
-        run = hhtjax.simulate(system, stepper, rest, rest, params, dt=DT, num_steps=STEPS, save_every=5)
+        run = hhtjax.simulate(
+            system, stepper, rest, rest, params, dt=DT, num_steps=STEPS, save_every=5
+        )
         jax.block_until_ready(run)
         seconds = time.perf_counter() - begin
     run.check()
@@ -75,7 +88,15 @@ free, cost = timed(linear, stepper, {"strike": strike})
 print(f"{cost:.0f} microseconds a step")
 
 figure, (left, right) = hhtjax.plot.subplots(1, 2, width=175, height=65, width_ratios=(3, 2))
-image = left.pcolormesh(free.t[:100] * 1e3, x, 1e3 * free.q[:100].T, cmap="RdBu", vmin=-8, vmax=8, shading="nearest")
+image = left.pcolormesh(
+    free.t[:100] * 1e3,
+    x,
+    1e3 * free.q[:100].T,
+    cmap="RdBu",
+    vmin=-8,
+    vmax=8,
+    shading="nearest",
+)
 left.set(xlabel="time (ms)", ylabel="place along the beam (m)")
 left.grid(False)
 figure.colorbar(image, label="deflection (mm)")
@@ -87,15 +108,16 @@ right.set(xlabel="frequency (Hz)", ylabel="amplitude at a sixth\nof the length",
 plt.show()
 
 # %% [markdown]
-# **Look at** the left for the bulge that runs up and down the beam, and at the right for the peaks at the theoretical
-# frequencies (dotted).
+# **Look at** the left for the bulge that travels along the beam, and at the right for the
+# peaks at the theoretical frequencies (dotted).
 #
 # ## With a stop: nonlinear
 #
-# Now the middle hits a stop 3 mm away, a one-sided spring. One nonlinear force among 200 unknowns, and the matrix
-# changes in time. `hht(solve=hhtjax.banded(2))` finds the five bands of a step's matrix with five derivatives in place
-# of 200, and eliminates within them. Was the number of bands right? The solver looks at what it leaves unsolved, and
-# `check()` would say so.
+# Now the middle hits a stop 3 mm away, a one-sided spring. This is one nonlinear force among
+# 200 unknowns, and the matrix changes in time. `hht(solve=hhtjax.banded(2))` computes the
+# five bands of a step's matrix from five derivatives instead of 200, and eliminates within
+# the bands. Was the number of bands right? The solver checks what it leaves unsolved, and
+# `check()` would report it.
 
 
 # %%
@@ -115,7 +137,10 @@ fast = hhtjax.hht(alpha=-0.1, linearize="predictor", solve=hhtjax.banded(2))
 hit, cost = timed(beam, fast, params)
 print(f"{cost:.0f} microseconds a step")
 far, _ = timed(beam, fast, params | {"gap": 1.0})
-print(f"with the stop out of reach: {1e3 * jnp.abs(far.q - free.q).max():.1e} mm from the linear run")
+print(
+    f"with the stop out of reach: {1e3 * jnp.abs(far.q - free.q).max():.1e} mm from the "
+    "linear run"
+)
 wrong = hhtjax.hht(alpha=-0.1, linearize="predictor", solve=hhtjax.banded(1))
 try:
     timed(beam, wrong, params)
@@ -131,11 +156,13 @@ axes.set(xlabel="time (ms)", ylabel="deflection of\nthe middle (mm)", xlim=(0, 3
 axes.legend()
 plt.show()
 depth = 1e3 * float(jnp.max(hit.q[:, N // 2])) - 3
-print(f"the stop is pressed in by {depth:.2f} mm at most, a force of {1e5 * depth / 1e3:.0f} N")
+print(
+    f"the stop is pressed in by {depth:.2f} mm at most, a force of {1e5 * depth / 1e3:.0f} N"
+)
 
 # %% [markdown]
 # ## What to try next
 #
-# * Halve the step: does the force of the stop change? It is a contact; see notebook 7.
-# * N = 2000, with `banded(2)`: the time of a step should grow tenfold, not a hundredfold.
-# * Make EI a parameter, and differentiate the deflection in it.
+# * Halve the step. Does the force of the stop change? It is a contact; see notebook 7.
+# * Take N = 2000 with `banded(2)`. The time of a step should grow tenfold, not a hundredfold.
+# * Make EI a parameter, and differentiate the deflection with respect to it.

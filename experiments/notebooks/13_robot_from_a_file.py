@@ -1,9 +1,9 @@
 # %% [markdown]
 # # 13. Your robot from a file
 #
-# Robots and machines are described in MJCF or URDF files. `hhtjax.bodies.load` reads both, and makes a `System` of it:
-# every integrator, fit and sweep of this library then takes your robot. The package `mujoco` is needed for reading, and
-# for nothing else: `pip install "hhtjax[models]"`.
+# MJCF and URDF files describe robots and machines. `hhtjax.bodies.load` reads both and makes
+# a `System`. You can then use every integrator, fit and sweep of this library. Only reading
+# needs the package `mujoco`: `pip install "hhtjax[models]"`.
 
 # %%
 import base64
@@ -23,13 +23,18 @@ from hhtjax import bodies
 
 jax.config.update("jax_enable_x64", True)
 plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
-FILE = next(path for path in (Path("robot.xml"), Path("experiments/notebooks/robot.xml")) if path.exists())
+FILE = next(
+    path
+    for path in (Path("robot.xml"), Path("experiments/notebooks/robot.xml"))
+    if path.exists()
+)
 
 # %% [markdown]
 # ## Loading it
 #
-# `robot.xml`, beside this notebook, is an arm with three joints and a servo on each. Its shapes could touch, and its
-# joints have ranges. What a file holds and a model would leave out is never dropped silently:
+# `robot.xml`, beside this notebook, is an arm with three joints and a servo on each. Its
+# shapes could touch, and its joints have ranges. If a file contains something that the model
+# does not support, loading raises an error:
 
 # %%
 try:
@@ -38,8 +43,8 @@ except NotImplementedError as error:
     print(error)
 
 # %% [markdown]
-# So we say what we want: no contact, and ranges that are not looked at (`limits="stop"` would make them springs, and
-# `limits="event"` would end a motion there).
+# So we say what we want: no contact, and no ranges of the joints. (`limits="stop"` would turn
+# the ranges into springs, and `limits="event"` would end a motion there.)
 
 # %%
 robot = bodies.load(FILE, ignore=("contact",), limits="ignore")
@@ -51,8 +56,8 @@ for name, value in robot.params.items():
     print(f"  params[{name!r}]: {jnp.shape(value)}")
 
 # %% [markdown]
-# All numbers are in `robot.params`, a dict of arrays: change them, fit them, differentiate in them. Frames of bodies
-# and of marked points come from one function:
+# All numbers are in `robot.params`, a dict of arrays. You can change, fit or differentiate
+# them. One function returns the frames of bodies and of marked points:
 
 # %%
 q = jnp.array([0.4, 0.6, 0.9])
@@ -64,11 +69,14 @@ print("its Jacobian:\n", np.round(J, 4))
 # %% [markdown]
 # ## Are these the right equations?
 #
-# The same state in MuJoCo: its mass matrix and its acceleration, beside ours.
+# We compute the mass matrix and the acceleration of one state with MuJoCo, and compare them
+# with ours.
 
 # %%
 theirs = mujoco.MjModel.from_xml_path(str(FILE))
-theirs.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+theirs.opt.disableflags |= (
+    mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+)
 data = mujoco.MjData(theirs)
 v, ctrl = jnp.array([0.5, -0.3, 0.8]), jnp.array([0.5, 0.5, 1.0])
 data.qpos[:], data.qvel[:], data.ctrl[:] = q, v, ctrl
@@ -78,13 +86,16 @@ mujoco.mj_fullM(theirs, data, dense)
 params = robot.params | {"ctrl": ctrl}
 M = bodies.mass_matrix(robot, q, params)
 w = jnp.linalg.solve(M, robot.system.force(q, v, 0.0, params))
-print(f"largest difference: mass matrix {np.abs(M - dense).max():.0e}, acceleration {np.abs(w - data.qacc).max():.0e}")
+print(
+    f"largest difference: mass matrix {np.abs(M - dense).max():.0e}, acceleration "
+    f"{np.abs(w - data.qacc).max():.0e}"
+)
 
 # %% [markdown]
 # ## From one pose to another
 #
-# The set points of the servos are functions of time: here smooth motions of one second, and a rest. Whatever is in
-# `params["ctrl"]` may be an array, a function of t, or a sampled record.
+# The set points of the servos are functions of time. Here they move smoothly for one second
+# and then rest. `params["ctrl"]` may be an array, a function of t, or a sampled record.
 
 # %%
 FIRST, LAST = np.array([-1.0, -0.4, 0.3]), np.array([1.0, 0.7, 1.1])
@@ -102,7 +113,9 @@ rest = jnp.zeros(3)
 
 def move(robot, params, dt=5e-3):
     """A motion of 1.5 s."""
-    return hhtjax.simulate(robot.system, hhtjax.hht(), FIRST, rest, params, dt=dt, num_steps=round(1.5 / dt))
+    return hhtjax.simulate(
+        robot.system, hhtjax.hht(), FIRST, rest, params, dt=dt, num_steps=round(1.5 / dt)
+    )
 
 
 begin = time.perf_counter()
@@ -125,10 +138,11 @@ with tempfile.TemporaryDirectory() as folder:
 display(HTML(f'<img alt="The arm on its way" src="data:image/gif;base64,{content}">'))
 
 # %% [markdown]
-# ## How large a step?
+# ## How long a step?
 #
-# Servos are stiff springs. The same arm, let go from the first pose while the servos already ask for the last: after
-# 0.2 s, by both programs, with several steps.
+# Servos are stiff springs. We release the same arm from the first pose while the servos
+# already demand the last pose. We compare the angles after 0.2 s from both programs, with
+# several steps.
 
 # %%
 sudden = robot.params | {"ctrl": LAST}
@@ -151,7 +165,9 @@ ours = hhtjax.sweep(
 )  # all steps in one program
 exact = mujocos(1e-5, mujoco.mjtIntegrator.mjINT_RK4)
 figure, axes = hhtjax.plot.subplots(width=120, height=65)
-axes.loglog(1e3 * STEPS, np.abs(ours.q[:, -1] - exact).max(axis=1), "o-", label="hhtjax, hht()")
+axes.loglog(
+    1e3 * STEPS, np.abs(ours.q[:, -1] - exact).max(axis=1), "o-", label="hhtjax, hht()"
+)
 for name, line in (("IMPLICITFAST", "s--"), ("RK4", "^:")):
     found = [mujocos(dt, getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for dt in STEPS]
     errors = [np.abs(x - exact).max() for x in found]
@@ -163,18 +179,22 @@ axes.legend()
 plt.show()
 
 # %% [markdown]
-# **Look at** the slopes: ours is of order 2, `implicitfast` of order 1, the method of Runge and Kutta of order 4. That
-# one is ahead where the step is short against the servos' own motion, and blows up where it is not.
-# `python -m experiments robots` compares more robots, with flexible joints and loops, and times.
+# **Look at** the slopes. Ours has order 2, `implicitfast` order 1, and the method of Runge
+# and Kutta order 4. The latter is the most accurate if the step is short compared with the
+# servos' own motion. Otherwise it blows up. [Robots](../robots/README.md) compares more
+# robots, with flexible joints and loops, and their times.
 #
 # ## Dry friction, in five lines
 #
-# The file says nothing of friction, as most do not. We add it by name. It is set-valued: at rest a joint bears any
-# torque up to its limit, and does not creep.
+# Like most files, this one contains no friction. We add it by name. It is set-valued: a joint
+# at rest holds any torque up to its limit, and does not creep.
 
 # %%
 rubbing = bodies.load(
-    FILE, ignore=("contact",), limits="ignore", joints={"*": {"friction": 12.0}, "elbow": {"friction": 6.0}}
+    FILE,
+    ignore=("contact",),
+    limits="ignore",
+    joints={"*": {"friction": 12.0}, "elbow": {"friction": 6.0}},
 )
 params = rubbing.params | {"ctrl": ramp}
 stuck = move(rubbing, params)
@@ -192,11 +212,13 @@ panels[0].legend()
 plt.show()
 
 # %% [markdown]
-# **Look at** the ends: with friction each joint stops where the servo's torque fits into the limit, and stays there.
+# **Look at** the ends. With friction each joint stops where the servo's torque is within the
+# limit, and stays there.
 #
-# ## What depends on what
+# ## What depends on what?
 #
-# Gradients pass through the integrator. By how much would the arm end elsewhere, if the forearm were heavier?
+# Gradients pass through the integrator. How much would the end position change if the forearm
+# were heavier?
 
 
 # %%
@@ -213,7 +235,9 @@ for name, value in zip(robot.bodies, slope, strict=True):
 # %% [markdown]
 # ## What to try next
 #
-# * Your own file: `bodies.load("your_robot.urdf", base="free")` for one that is not bolted down.
-# * `more=[bodies.Body("payload", "forearm", mass=2.5, position=(0.5, 0, 0), ...)]` hangs something on it.
-# * `limits="stop"`, and a set point beyond the range of the elbow.
-# * Notebook 14 finds friction and payload from a record.
+# * Load your own file: `bodies.load("your_robot.urdf", base="free")` for a robot that is not
+#   fixed to the ground.
+# * `more=[bodies.Body("payload", "forearm", mass=2.5, position=(0.5, 0, 0), ...)]` attaches a
+#   payload.
+# * Use `limits="stop"`, and a set point beyond the range of the elbow.
+# * Notebook 14 estimates friction and payload from a record.

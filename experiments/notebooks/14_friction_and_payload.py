@@ -1,10 +1,11 @@
 # %% [markdown]
 # # 14. A robot's friction and payload
 #
-# An arm from a file, angles from its encoders, torques from its motors. Unknown: dry and viscous friction of each
-# joint, and what hangs on the flange: its mass, where its centre is, and its inertia. In this order: what can a motion
-# tell at all? Which motion tells it best? A first estimate that simulates nothing. Then the fit through the integrator,
-# with errors that can be trusted.
+# An arm is loaded from a file. Its angles come from encoders and its torques from motors.
+# Unknown are the dry and viscous friction of each joint, and the payload on the flange: its
+# mass, centre and inertia. We first ask what a motion can show at all, and which motion shows
+# it best. Then we make a first estimate without any simulation. Last is the fit through the
+# integrator, with reliable errors.
 
 # %%
 import time
@@ -17,62 +18,89 @@ import numpy as np
 
 import hhtjax
 from hhtjax import bodies
-from hhtjax.identification import base_parameters, excitation, inertia_coordinates, physical_inertia
+from hhtjax.identification import (
+    base_parameters,
+    excitation,
+    inertia_coordinates,
+    physical_inertia,
+)
 
 jax.config.update("jax_enable_x64", True)
 plt.rcParams.update(hhtjax.plot.styles.PARAMETERS)
-FILE = next(path for path in (Path("robot.xml"), Path("experiments/notebooks/robot.xml")) if path.exists())
+FILE = next(
+    path
+    for path in (Path("robot.xml"), Path("experiments/notebooks/robot.xml"))
+    if path.exists()
+)
 
 # %% [markdown]
-# The arm of notebook 13, whose joints rub, with a body on its flange. All numbers of it are guesses.
+# This is the arm of notebook 13 with friction in its joints and a body on its flange. All
+# numbers of friction and body are guesses.
 
 # %%
-payload = bodies.Body("payload", "forearm", position=(0.5, 0, 0), mass=1.0, inertia=(0.01, 0.01, 0.01))
+payload = bodies.Body(
+    "payload", "forearm", position=(0.5, 0, 0), mass=1.0, inertia=(0.01, 0.01, 0.01)
+)
 robot = bodies.load(
-    FILE, ignore=("contact",), limits="ignore", joints={"*": {"friction": 5.0, "damping": 5.0}}, more=[payload]
+    FILE,
+    ignore=("contact",),
+    limits="ignore",
+    joints={"*": {"friction": 5.0, "damping": 5.0}},
+    more=[payload],
 )
 print(robot.bodies, robot.joints)
 
 # %% [markdown]
-# ## What can a motion tell?
+# ## What can a motion show?
 #
-# Torques are linear in the ten inertial parameters of each body: mass, first moments, moments and products of inertia.
-# Many of the 40 here never show, or only in sums. How many combinations do, is the rank of a matrix, the *regressor*:
+# Torques are linear in the ten inertial parameters of each body: mass, first moments, moments
+# and products of inertia. Of the 40 parameters here many have no effect, or only as sums. The
+# number of combinations that can be identified is the rank of a matrix, the *regressor*:
 
 # %%
 base = base_parameters(robot)
-print(f"{len(robot.bodies) * 10} inertial parameters, of which a motion can tell {base.count} combinations")
+print(
+    f"{len(robot.bodies) * 10} inertial parameters, of which a motion can tell "
+    f"{base.count} combinations"
+)
 print("never seen:", ", ".join(base.unseen))
 
 # %% [markdown]
-# The links are known from their drawings, the rotors (`armature`) from data sheets. The payload alone is unknown:
-# `physical_inertia` makes mass, centre and inertia of ten numbers without limits, so that no step of a fit ever leaves
-# what a body can have.
+# The links are known from their drawings, and the rotors (`armature`) from data sheets. Only
+# the payload is unknown. `physical_inertia` makes mass, centre and inertia from ten numbers
+# without limits. So no step of a fit leaves the range of real bodies.
 #
-# ## A motion that tells much
+# ## A motion that shows much
 #
-# `excitation` looks for a periodic motion, inside ranges of angle and speed, whose regressor is well conditioned.
+# `excitation` looks for a periodic motion, within ranges of angle and speed, whose regressor
+# is well conditioned.
 
 # %%
 begin = time.perf_counter()
 PERIOD, RATE = 5.0, 250
-found = excitation(robot, period=PERIOD, harmonics=4, amplitude=[1.2, 0.7, 0.8], speed=2.0, iterations=60)
+found = excitation(
+    robot, period=PERIOD, harmonics=4, amplitude=[1.2, 0.7, 0.8], speed=2.0, iterations=60
+)
 print(
-    f"condition {found.start:.0f} of a random motion, {found.condition:.0f} after {time.perf_counter() - begin:.0f} s"
+    f"condition {found.start:.0f} of a random motion, {found.condition:.0f} after "
+    f"{time.perf_counter() - begin:.0f} s"
 )
 trajectory = found.trajectory
 
 # %% [markdown]
 # ## The record
 #
-# Made here, so that we know the truth: the arm follows the motion for two periods, simulated with steps of a quarter of
-# a millisecond. Encoders count 2 pi/65536; torques have noise of 0.3 N m, samples come every 4 ms.
+# We generate the record, so we know the true values. The arm follows the motion for two
+# periods, simulated with steps of a quarter of a millisecond. The encoders have a resolution
+# of 2 pi/65536. The torques have noise of 0.3 N m. A sample is taken every 4 ms.
 
 # %%
 truth = {
     "frictionloss": np.array([9.0, 12.0, 4.0]),
     "damping": np.array([6.0, 9.0, 3.0]),
-    "payload": inertia_coordinates(2.5, jnp.array([0.06, 0.02, -0.03]), jnp.diag(jnp.array([0.012, 0.015, 0.010]))),
+    "payload": inertia_coordinates(
+        2.5, jnp.array([0.06, 0.02, -0.03]), jnp.diag(jnp.array([0.012, 0.015, 0.010]))
+    ),
 }
 guess = {
     "frictionloss": 5.0 * np.ones(3),
@@ -94,7 +122,13 @@ def simulate(unknown, dt, num_steps, save_every=1):
     """The arm on its servos, along the motion."""
     start = trajectory.motion(0.0)[:2]
     return hhtjax.simulate(
-        robot.system, hhtjax.hht(), *start, complete(unknown), dt=dt, num_steps=num_steps, save_every=save_every
+        robot.system,
+        hhtjax.hht(),
+        *start,
+        complete(unknown),
+        dt=dt,
+        num_steps=num_steps,
+        save_every=save_every,
     )
 
 
@@ -119,12 +153,13 @@ panels[1, 0].set(ylabel="torque (N m)")
 plt.show()
 
 # %% [markdown]
-# **Look at** the torques for the steps where a joint turns round: dry friction.
+# **Look at** the jumps of the torques where a joint reverses. They are dry friction.
 #
-# ## A first estimate, which simulates nothing
+# ## A first estimate, without simulation
 #
-# `equation_error` puts filtered angles, speeds and accelerations into the equations of motion, with the measured torque
-# in the place of the servos. What is left over is made small. The payload's inertia is left at its guess.
+# `equation_error` inserts filtered angles, speeds and accelerations into the equations of
+# motion, with the measured torque instead of the servos. The fit minimises the rest. The
+# payload's inertia stays at its guess.
 
 # %%
 rows = hhtjax.equation_error(robot.system, angles, 1 / RATE, cutoff=12.0)
@@ -140,24 +175,34 @@ def left_over(some):
 
 begin = time.perf_counter()
 known = {name: guess[name] for name in ("frictionloss", "damping")}
-first = hhtjax.fit(left_over, known | {"mass": guess["payload"][0], "centre": guess["payload"][7:]})
+first = hhtjax.fit(
+    left_over, known | {"mass": guess["payload"][0], "centre": guess["payload"][7:]}
+)
 start = {name: first.params[name] for name in known}
-start["payload"] = guess["payload"].at[0].set(first.params["mass"]).at[7:].set(first.params["centre"])
+start["payload"] = (
+    guess["payload"].at[0].set(first.params["mass"]).at[7:].set(first.params["centre"])
+)
 print(f"{time.perf_counter() - begin:.0f} s")
 for name in known:
     print(f"{name}: {np.round(start[name], 3)}, in truth {truth[name]}")
 body = physical_inertia(start["payload"])
-print(f"payload: {body['mass']:.3f} kg at {np.round(body['com'], 4)} m, in truth 2.5 kg at [0.06, 0.02, -0.03]")
+print(
+    f"payload: {body['mass']:.3f} kg at {np.round(body['com'], 4)} m, in truth 2.5 kg at "
+    "[0.06, 0.02, -0.03]"
+)
 
 # %% [markdown]
 # ## The fit through the integrator
 #
-# Now the whole motion is simulated, 2500 steps of 4 ms, and angles are compared with encoder counts. Jacobians come
-# through every step, also those where a joint sticks. A wide prior on the payload's ten numbers says what a body of
-# this size has, where the record says nothing.
+# Now the whole motion is simulated, with 2500 steps of 4 ms, and angles are compared with
+# encoder readings. Derivatives go through every step, including those in which a joint
+# sticks. The record does not determine all ten numbers of the payload. A wide prior says what
+# a body of this size can have.
 
 # %%
-wide = hhtjax.Gaussian(np.asarray(guess["payload"]), np.array([2.0, *[1.0] * 3, *[0.5] * 3, *[0.3] * 3]))
+wide = hhtjax.Gaussian(
+    np.asarray(guess["payload"]), np.array([2.0, *[1.0] * 3, *[0.5] * 3, *[0.3] * 3])
+)
 noise = count / np.sqrt(12)
 
 
@@ -185,12 +230,25 @@ def in_a_row(x, mass):
     return np.concatenate([*(np.ravel(x[kind]) for kind in known), [mass]])
 
 
-true, initial = in_a_row(truth, 2.5), in_a_row(start, physical_inertia(start["payload"])["mass"])
-estimates, errors = in_a_row(result.params, body["mass"]), in_a_row(result.standard_errors, within / 1.96)
+true, initial = (
+    in_a_row(truth, 2.5),
+    in_a_row(start, physical_inertia(start["payload"])["mass"]),
+)
+estimates, errors = (
+    in_a_row(result.params, body["mass"]),
+    in_a_row(result.standard_errors, within / 1.96),
+)
 figure, axes = hhtjax.plot.subplots(width=150, height=90)
 place = np.arange(len(names))
 axes.plot(100 * (initial / true - 1), place, "s", label="equation error")
-axes.errorbar(100 * (estimates / true - 1), place, xerr=196 * errors / true, fmt="o", capsize=3, label="fit, 95 %")
+axes.errorbar(
+    100 * (estimates / true - 1),
+    place,
+    xerr=196 * errors / true,
+    fmt="o",
+    capsize=3,
+    label="fit, 95 %",
+)
 axes.axvline(0, color="black", lw=0.8)
 axes.set_yticks(place, names)
 axes.invert_yaxis()
@@ -199,11 +257,14 @@ axes.legend()
 plt.show()
 
 # %% [markdown]
-# **Look at** how far the first estimate was off, and how little is left. The bars do not hold the error of the step, 4
-# ms here against a quarter of one in the record: see notebook 3.
+# **Look at** the errors of the first estimate, and at what the fit leaves of them. The
+# intervals do not contain the error of the step, which is 4 ms here and a quarter of a
+# millisecond in the record: see notebook 3.
 #
 # ## What to try next
 #
-# * The same with a random motion in the place of the excitation: which intervals grow?
-# * `joints={"*": {"friction": 0.0}}`, and a smooth tanh friction in its place: the residuals show where it creeps.
-# * Your own record: `angles` and `torques` are arrays (samples, joints), and nothing else is needed.
+# * Use a random motion instead of the excitation. Which intervals grow?
+# * Use `joints={"*": {"friction": 0.0}}` and a smooth tanh friction. The residuals show where
+#   it creeps.
+# * Use your own record: `angles` and `torques` are arrays (samples, joints). Nothing else is
+#   needed.
