@@ -81,7 +81,7 @@ def test_so_are_those_of_other_functions_and_any_other_names_pass():
         TypeError, match=re.escape("constraint(q, t, params); received one with the arguments (t, q, p)")
     ):
         System(np.ones(2), pull, lambda t, q, p: q[:1])
-    with pytest.raises(TypeError, match=r"arguments \(q, v, t, p\)\. Velocities that are held, .* are `sliding` with"):
+    with pytest.raises(TypeError, match=r"arguments \(q, v, t, p\)\. For a velocity constraint, .* use `sliding` with"):
         System(np.ones(2), pull, lambda q, v, t, p: v[:1])
     with pytest.raises(TypeError, match=re.escape("rate(y, t, params); received one with the arguments (t, y, p)")):
         hhtjax.FirstOrderSystem(lambda t, y, p: y)

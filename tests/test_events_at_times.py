@@ -227,7 +227,7 @@ def test_times_that_do_not_increase_are_named_under_jit_too():
         return loaded(T)
 
     unsorted = np.array([0.0, 0.5, 0.3, 0.6, 0.7, 0.8, 0.9])
-    message = "step 1 (to t = 0.1) failed: q and v are numbers, but not the guard of event 0"
+    message = "step 1 (to t = 0.1) failed: q and v are finite, but the guard is NaN at event 0"
     check_message(hhtjax.SimulationError, message, jax.jit(end)(unsorted).check)
     check_message(ValueError, "simulate: events[0]: `at` must hold numbers in increasing order", lambda: end(unsorted))
 
