@@ -190,7 +190,7 @@ ENDS = {"Unhashable()": "Make it a pytree"}
     ],
 )
 def test_params_are_numbers_or_functions(value, received, what):
-    end = ENDS.get(received, "What is none of them")
+    end = ENDS.get(received, "Put other values into")
     message = f"`params['k'][1]` must be {what}; received {received}. {end}"
     for call in (
         lambda params: run(System(np.ones(2), pull), params=params),

@@ -244,7 +244,7 @@ ERRORS = {
                  lambda: Event(at=[2.0, 1.0])),
     "no number": (ValueError, "Event: `at` must hold numbers in increasing order; received nan.",
                   lambda: Event(at=np.nan)),
-    "an impact": (TypeError, "Event: an impact needs the direction of a `guard`; received one with `at`.",
+    "an impact": (TypeError, "Event: an impact needs the direction of a `guard`; received `at` without one.",
                   lambda: Event(at=1.0, reset=impact(0.5))),
     "arguments": (TypeError, "Event: `at` is called as at(params); received a function of 2 positional",
                   lambda: Event(at=lambda p, q: 1.0)),
