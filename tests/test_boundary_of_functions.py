@@ -62,7 +62,7 @@ def test_a_double_result_for_a_single_state_is_named(name):
         return -params["force"] * q.astype(params["force"].dtype)
 
     params = {"mass": SINGLE, "force": SINGLE, name: ONE}
-    message = f"simulate: `{name}` returned float64 for a state of float32; give params"
+    message = f"simulate: `{name}` returned float64 for a state of float32. Give params"
     with pytest.warns(PrecisionWarning), pytest.raises(TypeError, match=re.escape(message)):
         run(System(mass, force), q0=SINGLE, v0=0 * SINGLE, params=params)
 

@@ -122,9 +122,9 @@ def simulate(
             estimate.
         keep_events: number of events that `run.events` can hold.
         output: a function whose arguments are any of q, v, w (the acceleration), L (multipliers), z, zdot, friction,
-            sticking, t and params, by these names: `output(q, w, params)`, `output(q, v, w, L, z, t, params)`. It
-            returns a pytree of arrays, which is saved as `run.output` instead of q, v and everything else. A long run
-            of a large system then needs little memory. `check` works as before. Quantities that the system does not
+            sticking, contact, t and params, by these names: `output(q, w, params)`, `output(q, v, w, L, z, t, params)`.
+            It returns a pytree of arrays, which is saved as `run.output` instead of q, v and everything else. A long
+            run of a large system then needs little memory. `check` works as before. Quantities that the system does not
             have are None. For a first-order system q is y and v its rate. params are those valid at the time, after
             switches of events and with held inputs. Richardson extrapolation is applied to each number of the output;
             do not return rotations unless entrywise extrapolation is what you want. `verify` compares q at the samples,

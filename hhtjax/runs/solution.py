@@ -128,8 +128,8 @@ CONTACT = {  # what went wrong with contacts
     Fault.MANY: "contacts separate, stick and slide too often within the step. Take a smaller dt",
     Fault.JAMMED: "a contact jams: with so much friction, more normal force presses the bodies together (Painleve). "
     "Take less `friction`, or a compliant `force`",
-    Fault.SEVERAL: "several contacts that affect each other collide at the same time, with a `restitution` above 0: the "
-    "outcome depends on the order. Take restitution 0",
+    Fault.SEVERAL: "several contacts that affect each other collide at the same time, with a `restitution` above 0: "
+    "the outcome depends on the order. Take restitution 0",
     Fault.OPEN: "the gap of a closed contact was not brought to 0: its surfaces are too curved for the step. Take a "
     "smaller dt",
     Fault.OVERLAP: "at the start bodies overlap",
