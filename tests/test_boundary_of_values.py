@@ -237,7 +237,7 @@ def test_a_gradient_that_is_rounding_is_none():
         return jnp.stack([q[0] - 1, jnp.sin(0.3 * q[1]) ** 2 + jnp.cos(0.3 * q[1]) ** 2 - 1 + 1e-16 * (q[0] - 1)])
 
     with pytest.raises(
-        ValueError, match=r"`constraint` rows \[1\] have no gradient in q at the start but for rounding"
+        ValueError, match=r"`constraint` rows \[1\] have no gradient in q at the start \(only rounding\)"
     ):
         run(System(np.ones(2), pull, constraint))
 

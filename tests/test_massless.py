@@ -101,12 +101,12 @@ REFUSED = {
         "leave out held inputs",
     ),
     "an ode": (lambda: hhtjax.interop.ode(maxwell(5.0)), "coordinates without mass"),
-    "springs alone": (lambda: hhtjax.LinearSystem(M, None, K), "has to be damped"),
+    "springs alone": (lambda: hhtjax.LinearSystem(M, None, K), "must be damped"),
     "one of two nodes damped": (
         lambda: hhtjax.LinearSystem(np.diag([1.0, 0, 0]), np.diag([0.0, 5, 0]), np.eye(3)),
-        "has to be damped",
+        "must be damped",
     ),
-    "a negative damper": (lambda: maxwell(-5.0), "has to be damped"),
+    "a negative damper": (lambda: maxwell(-5.0), "must be damped"),
 }  # fmt: skip
 
 
