@@ -329,7 +329,7 @@ BARE = System(
     lambda q, v, t, p: -p["m"] * p["g"] + 0 * q,
     lambda q, t, p: (p["on"] * shaken_table.over_table(q, t, p))[None],
 )
-OFF = r"A row that params switch off, on \* Phi, leaves its multiplier without an equation: let it hold a coordinate s"
+OFF = r"A row that params switch off, on \* Phi, leaves its multiplier without an equation\. Let the row hold a coord"
 
 
 def bare(stepper, params, q0=0.0, events=SCENE.events):
