@@ -364,9 +364,9 @@ def first(L):
 
 
 ERRORS = {
-    "no constraint": (ValueError, "events[0]: the `guard` asks for `multipliers`, and the system has no constraint.",
+    "no constraint": (ValueError, "events[0]: the `guard` has an argument `multipliers`, but the system has no",
                       lambda: simulate(PULLED, rk4(), ONE, ONE, {"F": 1.0}, dt=0.1, num_steps=1, events=seen(first))),
-    "index 3": (NotImplementedError, 'events[0]: the `guard` asks for `multipliers`, and with formulation="index3"',
+    "index 3": (NotImplementedError, 'events[0]: the `guard` has an argument `multipliers`, and with formulation',
                 lambda: bare(hht(formulation="index3"), SCENE.params, events=seen(first))),
     "an impact": (ValueError, "the `guard` of an impact must depend on q and t only, not on multipliers",
                   lambda: bare(LIGHT, SCENE.params, events=seen(first, impact(0.0)))),

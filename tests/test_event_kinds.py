@@ -137,7 +137,7 @@ ERRORS = {
                  lambda: call([Event(lambda q, v, t, p: jnp.ones(2) * q[0])])),
     "arguments": (TypeError, "events[0]: `guard` must be a function guard(q, v, t, params)",
                   lambda: call([Event(lambda t: t)])),
-    "a stepper": (NotImplementedError, "KimHHT cannot begin anew behind an event",
+    "a stepper": (NotImplementedError, "KimHHT does not support events",
                   lambda: call([HEIGHT], stepper=hhtjax.kim_hht(0.0))),
     "beyond": (ValueError, "the start is beyond the guard of events[1]: it is -1, with the rate 0",
                lambda: call([HEIGHT, Event(lambda q, v, t, p: q[0] - 2.0, impact(0.5))])),

@@ -130,7 +130,5 @@ def test_starts_of_workers(threads):
     np.testing.assert_allclose(found.best.params["k"], alone.best.params["k"], rtol=1e-9)
     np.testing.assert_allclose(found.all.cost, alone.all.cost, rtol=1e-9)
     assert found.best.summary().splitlines()[1:4] == alone.best.summary().splitlines()[1:4]
-    with pytest.raises(
-        TypeError, match="multistart: with an `executor`, arguments must not be tracers: call it outside"
-    ):
+    with pytest.raises(TypeError, match="multistart: with an `executor`, all arguments must be known: call it outside"):
         jax.jit(lambda k: hhtjax.multistart(one, starts | {"k": k}, executor=threads).best.cost)(starts["k"])
