@@ -404,7 +404,7 @@ WRONG = {
     "function": r"Elements: `function` is called as function\(q, v, t, params\); received a function of 1",
     "function with each": r"is called as function\(q, v, t, params, each\); received a function of 4",
     "mass function": r"`mass` is called as mass\(q, w, params\); received a function of 4",
-    "two masses": "`mass` must hold one part that sits at nodes, and Elements; received",
+    "two masses": "`mass` must hold one mass at the nodes, and Elements; received",
 }
 
 

@@ -115,21 +115,21 @@ def sampled(values: Real, dt: Real = None, t0: Real = 0.0, order: int = 3, *, ti
     """The function of time through `values[k]` at t0 + k dt, or at times[k]: a pytree for params, called with t.
 
     Args:
-            values: (samples,) or (samples, channels...), real; at least order + 1 samples.
-            dt: sampling period, positive; t0: time of the first sample.
-            times: (samples,), instead of dt and t0: strictly increasing, at any distances. A call then needs a
-                bisection too, some nanoseconds in a compiled run.
-            order: 0: each value is held until the next, as by a D/A converter; 1: linear; 3: cubic spline, twice
-                continuously differentiable ("not-a-knot" ends, as in SciPy's CubicSpline).
+        values: (samples,) or (samples, channels...), real; at least order + 1 samples.
+        dt: sampling period, positive; t0: time of the first sample.
+        times: (samples,), instead of dt and t0: strictly increasing, at any distances. A call then needs a
+            bisection too, some nanoseconds in a compiled run.
+        order: 0: each value is held until the next, as by a D/A converter; 1: linear; 3: cubic spline, twice
+            continuously differentiable ("not-a-knot" ends, as in SciPy's CubicSpline).
 
-        A run treats a held input in params as constant over each step. Steps that end on its jumps keep their order. A
-        jump within a step reduces the order to 1; outside of jit a `JumpWarning` says so. `sweep(..., times=)` ends
-        steps at jumps at any distances, and `adaptive` finds the jumps by itself. At a jump, the saved acceleration is
-        the one before it; `interpolate` also uses it for v after the jump.
+    A run treats a held input in params as constant over each step. Steps that end on its jumps keep their order. A
+    jump within a step reduces the order to 1; outside of jit a `JumpWarning` says so. `sweep(..., times=)` ends
+    steps at jumps at any distances, and `adaptive` finds the jumps by itself. At a jump, the saved acceleration is
+    the one before it; `interpolate` also uses it for v after the jump.
 
-        Outside the samples the nearest end value is held. Differentiable in values, times and t. A simulation sees an
-        input only through its values at the steps. If the step is shorter than dt, the reconstruction between the
-        samples matters, and the cubic one is far better for smooth signals.
+    Outside the samples the nearest end value is held. Differentiable in values, times and t. A simulation sees an
+    input only through its values at the steps. If the step is shorter than dt, the reconstruction between the
+    samples matters, and the cubic one is far better for smooth signals.
 
     Returns:
         A `Sampled`: t -> a number, or (channels...).
