@@ -221,7 +221,7 @@ def test_lines_join_outputs(short):
 
 
 def test_a_run_without_its_path_is_refused_by_name(short):
-    with pytest.raises(ValueError, match="check: leave `reach` out: the run has kept its output, and no q"):
+    with pytest.raises(ValueError, match="check: leave `reach` out: the run saved `output` only, and no q"):
         short.check(reach=1.0)
     with pytest.raises(ValueError, match="energy_balance: `solution` must have q and v; received a run with output="):
         hhtjax.analysis.energy_balance(SPRING, short, START[2])
