@@ -63,26 +63,29 @@ Other packages
 `hhtjax.interop.scipy_rhs` returns the arguments of SciPy's `solve_ivp`, Jacobian included. Both reduce constraints to
 index 1. params may contain modules of equinox, such as a force that is a neural network: `simulate`, `sweep` and `fit`
 accept them, and `equinox.filter_grad` gives derivatives.
+
 Inputs
 ------
 
-A measured input is data: `sampled` makes a function of time of it, to be put into params, of samples at equal steps or
 `sampled` turns a measured input, with samples at equal steps or at any `times`, into a function of time; put it into
 params. Use `band_limited` for samples that are hardly denser than their highest frequency; `spline_gain_error` tells
 whether you need it.
+
+>>> u = hhtjax.sampled(jnp.sin(jnp.linspace(0.0, 6.0, 61)), dt=0.1)                # a cubic spline through the samples
 >>> run = hhtjax.simulate(spring, hhtjax.hht(), q0, v0, {"k": 9.0, "u": u}, dt=1e-2, num_steps=600)
 >>> run.check()
 
 Constraints
 -----------
 
-`System(mass, force, constraint)` with `constraint(q, t, params) -> (m,)` is a mechanism in more coordinates than it has
-freedoms. The `hht` family solves it, by default with one linear solve per step, and with both Phi = 0 and dPhi/dt = 0
 `System(mass, force, constraint)` with `constraint(q, t, params) -> (m,)` describes a mechanism with more coordinates
 than freedoms. The `hht` family solves it, by default with one linear solve per step. Both Phi = 0 and dPhi/dt = 0 are
 enforced, the latter by a second multiplier for each constraint (the formulation of Gear, Gupta and Leimkuhler, GGL).
 The solution contains the multipliers. Derivatives work, also with respect to lengths in the constraint.
 `consistent_initial` moves a start onto the constraint.
+
+>>> rod = hhtjax.System(
+...     mass=lambda q, params: params["m"] * jnp.ones(2),
 ...     force=lambda q, v, t, params: jnp.array([0.0, -9.81 * params["m"]]),
 ...     constraint=lambda q, t, params: jnp.array([jnp.sqrt(jnp.sum(q**2)) - params["l"]]))
 >>> params = {"m": 2.0, "l": 0.5}
