@@ -1,50 +1,51 @@
 """hhtjax: differentiable, functional time integrators for multibody dynamics.
 
-A system, a stepper, one run, and derivatives through all of it: `System`, `hht`, `simulate`, `fit`. What a step does to
-a motion is in `hhtjax.analysis`, examples to start from are in `hhtjax.scenes`, charts in `hhtjax.plot`.
+Define a `System`, choose a stepper such as `hht`, run it by `simulate`, and differentiate through all of it; `fit`
+identifies parameters. `hhtjax.analysis` shows how steps change a motion, `hhtjax.scenes` has examples to start from,
+`hhtjax.plot` draws charts.
 
     params ---> System(mass, force, constraint) ---> Stepper(begin, bind) ---> simulate, one scan ---> Solution
                                                                                       |
                                                              sweep, fit, analysis, interpolate, your own loop
 
-The house
+Structure
 ---------
 
-One room for each question, one floor above the other. An upper floor imports from lower ones, never the reverse, and a
-test says so (`tests/test_floors.py` holds the floors as data).
+Each folder answers one question. Folders form floors: an upper floor imports from lower ones, never the reverse.
+`tests/test_floors.py` holds the floors as data and checks this.
 
-    plot              charts of what the other rooms give; with the extra `plot`
+    plot              charts of results; with the extra `plot`
     scenes            examples: systems with parameters and initial values
-    identification    fits, and how far to trust them
-    analysis          what a step does to a motion
+    identification    fits, and the uncertainty of their results
+    analysis          accuracy, damping and energy of steps
     export            out of Python: a step as C, or as an FMU
-    runs              simulate, sweep, interpolate; `driver.py` has the way that every run takes,
+    runs              simulate, sweep, interpolate; `driver.py` has the common driver of all runs,
                       `event_step.py` divides a step at an event
     bodies            mechanisms of bodies and joints, or from model files, as a system
     steppers          one step, one file for each family. HHT: the formulas in `residual.py`, the step in
                       `generalized_alpha.py`, its one solve in `implicit_solve.py`
     elements          beams, cables, springs and joints of structures, as functions of one element
     systems           what moves: pytrees outside, one flat vector inside; constraints, rotations, inputs
-    numerics          solves, scans, loops, extrapolation: mathematics that knows no mechanics; rotation, trigonometry
+    numerics          solves, scans, loops, extrapolation: mathematics without mechanics; rotation, trigonometry
     xla               how a run becomes one kernel on the CPU
     jaxpr             evaluators of traced functions: number by number, as a matrix, as a list of operations
-    primitives        operations of JAX of our own, with their rules for derivatives and batches; JAX's version
-    description       frozen descriptions, known by identity; checks: every check of an argument, once
+    primitives        our own JAX operations, with their rules for derivatives and batches; JAX's version
+    description       frozen descriptions, compared by identity; checks: every check of an argument, once
 
-What holds everywhere:
+Rules everywhere:
 
-* Functions, and no state: a system and a stepper are frozen descriptions, static to `jit`; state, info and solution are
-  named tuples of arrays; what may change is in `params`, which is passed and never read from outside.
-* `jit`, `vmap` and `grad` go through everything. float32 and float64 keep their type.
-* A wrong argument is refused where it comes in, by an error that names the argument, its value and what was expected.
-  Inside a run nothing raises: what failed travels along as data, and `solution.check()` makes an error of it.
-* What a scene does not have costs nothing: without a constraint there is no row for it, with a constant mass no
+* Functions without state: a system and a stepper are frozen descriptions, static under `jit`; state, info and solution
+  are named tuples of arrays; what may change is in `params`, which is passed as an argument.
+* `jit`, `vmap` and `grad` work on everything. float32 and float64 keep their type.
+* A wrong argument raises an error at the public function. The error names the argument, its value and what was
+  expected. Inside a run nothing raises: a failure is recorded as data, and `solution.check()` turns it into an error.
+* Features that a scene does not use cost nothing: without a constraint there is no row for it, with a constant mass no
   derivative of it.
 
-How to add a stepper is in `hhtjax.steppers`, a scene in `hhtjax.scenes`, a rule for an operation in `hhtjax.jaxpr`. How
-to test it: the table of problems and steppers in `tests/zoo.py` drives the tests of order, derivatives, dtypes, batches
-and memory, so that a new entry is tested like all others. Beyond that, a test belongs to a behaviour, compares with
-what was not computed by the same code, and has been seen to fail.
+`hhtjax.steppers` explains how to add a stepper, `hhtjax.scenes` a scene, `hhtjax.jaxpr` a rule for an operation. To
+test it, add an entry to the table of problems and steppers in `tests/zoo.py`. This table drives the tests of order,
+derivatives, dtypes, batches and memory, so a new entry is tested like all others. Any further test checks one
+behaviour, compares with results that were not computed by the same code, and has been seen to fail.
 """
 
 import importlib

@@ -1,4 +1,4 @@
-"""Checks of arguments that every floor makes: they name the caller, the argument, and what was received."""
+"""Checks of arguments for all folders. Their errors name the caller, the argument, and what was received."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hhtjax.description import Array, PyTree, freeze, is_array, is_concrete, is_
 
 
 def require_number(caller: str, name: str, value, valid: Callable, expectation: str):
-    """The value as it is, if it is a real scalar within its range; a tracer passes unchecked."""
+    """Returns the value if it is a real scalar within its range; a tracer passes unchecked."""
     if not is_real(value) or getattr(value, "ndim", 0) != 0:
         large = is_array(value) and jnp.ndim(value) and (jnp.size(value) > 4 or not is_concrete(value))
         shown = f"an array of shape {jnp.shape(value)}" if large else repr(value)
@@ -26,7 +26,7 @@ def require_number(caller: str, name: str, value, valid: Callable, expectation: 
 
 
 def require_integer(caller: str, name: str, value, least: int = 1) -> int:
-    """The value as a Python integer, if it is one and not less than `least`."""
+    """Returns the value as a Python integer if it is an integer not less than `least`."""
     if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
         kind = {0: "an integer, 0 or more", 1: "a positive integer"}.get(least, f"an integer, {least} or more")
         raise ValueError(f"{caller}: `{name}` must be {kind}; received {value!r}.")
@@ -34,13 +34,13 @@ def require_integer(caller: str, name: str, value, least: int = 1) -> int:
 
 
 def require_one_of(caller: str, name: str, value, known: tuple):
-    """An error for what is none of the known values."""
+    """Raises an error unless the value is one of the known values."""
     if value not in known:
         raise ValueError(f"{caller}: `{name}` must be one of {', '.join(map(repr, known))}; received {value!r}.")
 
 
 def require_function(caller: str, name: str, value, signature: str):
-    """An error unless `value` can be called so, and is hashable, as a static argument of jit has to be."""
+    """Raises an error unless `value` can be called like this, and is hashable, as a static argument of jit must be."""
     if not callable(value):
         raise TypeError(f"{caller}: `{name}` must be a function {signature}; received {value!r}.")
     try:
@@ -63,20 +63,20 @@ def require_function(caller: str, name: str, value, signature: str):
 
 
 def positional_names(function):
-    """The names of the arguments that a function can be given by position; none where it does not tell."""
+    """The names of the arguments that can be passed by position; none if the function has no signature."""
     known = _signature(function)
     kinds = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
     return [] if known is None else [name for name, x in known.parameters.items() if x.kind in kinds]
 
 
 def takes(function, count: int) -> bool:
-    """Whether a function can be called with so many arguments, as far as it tells."""
+    """Whether a function can be called with `count` arguments; True if it has no signature."""
     called = _signature(function, follow_wrapped=False)
     return called is None or _takes(called, count)
 
 
 def _signature(function, **options):
-    """None where it does not tell."""
+    """The signature of a function; None if it has none."""
     try:
         return inspect.signature(function, **options)
     except (TypeError, ValueError):
@@ -84,7 +84,7 @@ def _signature(function, **options):
 
 
 def _takes(called, count: int) -> bool:
-    """Whether a function of this signature can be called with so many arguments."""
+    """Whether a function of this signature can be called with `count` arguments."""
     try:
         called.bind(*range(count))
     except TypeError:
@@ -93,7 +93,7 @@ def _takes(called, count: int) -> bool:
 
 
 def in_words(called) -> str:
-    """The arguments of a signature in words; those that have to be given by name are not positional."""
+    """The arguments of a signature in words; keyword-only ones are listed separately."""
     named = [name for name, x in called.parameters.items() if x.kind is x.KEYWORD_ONLY]
     first = [name for name in called.parameters if name not in named]
     words = f"{len(first)} positional argument{'s' * (len(first) != 1)} ({', '.join(first)})"
@@ -101,7 +101,7 @@ def in_words(called) -> str:
 
 
 def _in_other_order(names: list, expected: list) -> bool:
-    """Whether a time, by its name, is in the place of something else, or q and v change places."""
+    """Whether the names show a wrong order: a time in another place, or q and v interchanged."""
     names = ["t" if name == "time" else name for name in names[: len(expected)]]
     places = {name: i for i, name in enumerate(names) if name in expected}
     if "t" in places and places["t"] != expected.index("t"):
@@ -110,7 +110,8 @@ def _in_other_order(names: list, expected: list) -> bool:
 
 
 def require_params(caller: str, params: PyTree):
-    """The params as data, functions among them hidden; an error that names what is neither: text, objects."""
+    """Returns the params as data, with functions in them hidden. Raises an error for leaves that are neither: text,
+    objects."""
     if all(map(_is_data, jax.tree.leaves(params))):
         return params
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
@@ -121,7 +122,7 @@ def require_params(caller: str, params: PyTree):
         elif not data:
             shown = f"an array of {leaf.dtype}" if isinstance(leaf, np.ndarray) else repr(leaf)
             raise TypeError(
-                f"{where} must be an array, a number or a function; received {shown}. What is none of them belongs "
+                f"{where} must be an array, a number or a function; received {shown}. Put other values "
                 "into the functions of the system."
             )
     return freeze(params)
@@ -140,7 +141,7 @@ def _require_hashable(where: str, function: Callable):
     except TypeError:
         raise TypeError(
             f"{where} must be hashable, because a function is static under jit; received {function!r}. Make it a "
-            "pytree (an equinox.Module, a jax.tree_util.Partial), whose arrays are data."
+            "pytree (an equinox.Module, a jax.tree_util.Partial), so that its arrays are data."
         ) from None
 
 
@@ -159,7 +160,7 @@ def describe(x):
 
 
 def check_matrix(caller: str, name: str, matrix, n: int, dtype: np.dtype, *args: PyTree):
-    """A constant matrix, or the result of a function, of a shape that fits n and a dtype that fits the state."""
+    """Checks a constant matrix, or the result of a function: its shape must fit n, its dtype the state."""
     value = evaluate(caller, name, matrix, *args) if callable(matrix) else matrix
     shapes = [(n, n), (n,)] + [()] * (n == 1)
     if not (hasattr(value, "shape") and value.shape in shapes):
@@ -172,7 +173,7 @@ def check_matrix(caller: str, name: str, matrix, n: int, dtype: np.dtype, *args:
 
 
 def count(caller: str, name: str, function: Callable, most: int | None, dtype: np.dtype, *args: PyTree) -> int:
-    """m, for a function that returns (m,) with m <= most, if there is a most."""
+    """m, for a function that returns (m,); m must not exceed `most`, unless that is None."""
     value = evaluate(caller, name, function, *args)
     if not hasattr(value, "shape") or len(value.shape) != 1 or not 1 <= value.shape[0] <= (most or value.shape[0]):
         sizes = "m >= 1" if most is None else f"1 <= m <= {most}"
@@ -182,7 +183,7 @@ def count(caller: str, name: str, function: Callable, most: int | None, dtype: n
 
 
 def check_like(caller: str, name: str, value, like: PyTree, reference: Array, dtype: np.dtype):
-    """What a function returned, of the structure, the shapes and a dtype that fit the state."""
+    """Checks what a function returned: its structure, shapes and dtype must fit the state."""
     if jax.tree.structure(value) != jax.tree.structure(reference) or (
         jax.tree.map(jnp.shape, value) != jax.tree.map(jnp.shape, reference)
     ):
@@ -193,19 +194,19 @@ def check_like(caller: str, name: str, value, like: PyTree, reference: Array, dt
 
 
 def check_dtype(caller: str, name: str, value, dtype: np.dtype):
-    """An error for leaves of another dtype than that of the state; integers and Python numbers pass."""
+    """Raises an error for leaves whose dtype is not that of the state; integers and Python numbers pass."""
     for leaf in jax.tree.leaves(value):
         found = jnp.result_type(leaf)
         number = jnp.issubdtype(found, jnp.integer) or (leaf.weak_type and jnp.issubdtype(found, jnp.floating))
         if found != dtype and not number:
             raise TypeError(
-                f"{caller}: `{name}` returned {found} for a state of {dtype}; give params, and arrays made "
-                f"inside `{name}`, the dtype of q0, or q0 and v0 the dtype of params."
+                f"{caller}: `{name}` returned {found} for a state of {dtype}. Give params, and arrays made "
+                f"inside `{name}`, the dtype of q0; or give q0 and v0 the dtype of params."
             )
 
 
 def evaluate(caller: str, name: str, function, *args: PyTree):
-    """Shape of function(*args); `name` is added to what the function raises."""
+    """Shapes of function(*args); an error that the function raises gets a note with `name`."""
     try:
         return jax.eval_shape(lambda *args: function(*thaw(args)), *freeze(args))
     except Exception as error:
@@ -216,7 +217,7 @@ def evaluate(caller: str, name: str, function, *args: PyTree):
 
 @contextmanager
 def telling_of_arguments(caller: str, q0: PyTree, v0: PyTree, params: PyTree):
-    """Adds to an error of the user's functions, or of what they return, what may be wrong with the arguments."""
+    """Adds notes to an error of the user's functions about what may be wrong with the arguments."""
     try:
         yield
     except Exception as error:
@@ -227,12 +228,12 @@ def telling_of_arguments(caller: str, q0: PyTree, v0: PyTree, params: PyTree):
             known = ", ".join(sorted(map(repr, params))) or "none"
             error.add_note(f"{caller}: the keys of `params` are {known}; a function of the system asked for {error}.")
         if params is None and isinstance(error, (TypeError, AttributeError)):
-            error.add_note(f"{caller}: `params` was left out, so that the functions of the system received None.")
+            error.add_note(f"{caller}: `params` was left out, so the functions of the system received None.")
         raise
 
 
 def notes_on_lists(caller: str, name, tree: PyTree):
-    """A note on each list or tuple of numbers, which is no array to JAX."""
+    """A note on each list or tuple of numbers, which JAX does not take for an array."""
 
     def is_list(x):
         return type(x) in (list, tuple)
@@ -241,6 +242,6 @@ def notes_on_lists(caller: str, name, tree: PyTree):
         if is_list(x) and x and all(jnp.ndim(y) == 0 for y in jax.tree.leaves(x)):
             where = f"{name}{jax.tree_util.keystr(path)}"
             yield (
-                f"{caller}: `{where}` is a {type(x).__name__} of numbers, which to JAX is no array but a container of "
-                f"{len(x)}: if an array is meant, write jnp.array([...])."
+                f"{caller}: `{where}` is a {type(x).__name__} of numbers. JAX treats it as a container of "
+                f"{len(x)}, not as an array: if an array is meant, write jnp.array([...])."
             )

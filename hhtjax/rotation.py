@@ -1,16 +1,16 @@
-"""Finite rotations, for one rotation at a time; jax.vmap for batches.
+"""Finite rotations. Functions take one rotation; use jax.vmap for batches.
 
-R (3, 3) takes material components to spatial ones; Rdot = R hat(Om), Om the material angular velocity in rad/s.
-psi (3,), in rad, is a rotation vector: a turn by the angle |psi| about psi. With P = hat(psi), t = |psi| and x = t^2:
+R (3, 3) maps material components to spatial ones; Rdot = R hat(Om), with Om the material angular velocity in rad/s. psi
+(3,), in rad, is a rotation vector: a rotation by the angle |psi| about psi. With P = hat(psi), t = |psi| and x = t^2:
 
     exp  R    = I + c1 P + c2 P^2    c1 = sin t / t         c2 = (1 - cos t) / t^2
          T    = I - c2 P + c3 P^2    c3 = (t - sin t) / t^3
          T^-1 = I + P/2 + d P^2      d = (1 - (t/2) cot(t/2)) / t^2
 
-c1, c2 and c3 are functions of Stumpff (rotation.py), analytic in x: values and derivatives, forward and
-reverse, are right at psi = 0 too. Every function keeps the dtype, but integers become floats, and raises TypeError for
-what is no array of real numbers, ValueError for another shape. From and to quaternions: `from_quat`, `as_quat` of
-jax.scipy.spatial.transform.Rotation.
+c1, c2 and c3 are functions of Stumpff (rotation.py), analytic in x, so values and derivatives, forward and reverse, are
+correct at psi = 0 too. Every function keeps the dtype (integers become floats). It raises TypeError unless it receives
+an array of real numbers, and ValueError for a wrong shape. To convert from and to quaternions, use `from_quat` and
+`as_quat` of jax.scipy.spatial.transform.Rotation.
 
 Reference: Cardona, Geradin, Computers & Structures 33 (1989) 801-820, Sec. 3.
 """
@@ -58,7 +58,7 @@ def hat(x: Array) -> jax.Array:
 
     Args: x: (3,).
     Returns: (3, 3).
-    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+    Raises: TypeError, ValueError: not an array of real numbers, or of another shape.
 
     >>> print(hat(jnp.array([1.0, 2.0, 3.0])))
     [[ 0. -3.  2.]
@@ -70,11 +70,11 @@ def hat(x: Array) -> jax.Array:
 
 
 def vee(X: Array) -> jax.Array:
-    """The inverse of `hat`: x (3,) with hat(x) = X; if X (3, 3) is not skew, that of (X - X^T)/2.
+    """The inverse of `hat`: x (3,) with hat(x) = X; if X (3, 3) is not skew, the result for (X - X^T)/2.
 
     Args: X: (3, 3).
     Returns: (3,).
-    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+    Raises: TypeError, ValueError: not an array of real numbers, or of another shape.
 
     >>> print(vee(hat(jnp.array([1.0, 2.0, 3.0]))))
     [1. 2. 3.]
@@ -88,7 +88,7 @@ def exp(psi: Real) -> jax.Array:
 
     Args: psi: (3,), in rad.
     Returns: (3, 3).
-    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+    Raises: TypeError, ValueError: not an array of real numbers, or of another shape.
 
     >>> print((exp(jnp.array([0.0, 0.0, jnp.pi / 2])) @ jnp.array([1.0, 0.0, 0.0])).round(6) + 0.0)
     [0. 1. 0.]
@@ -102,14 +102,16 @@ def log(R: Array) -> jax.Array:
     """psi (3,), in rad, with exp(psi) = R and |psi| <= pi, for a rotation R (3, 3). Accurate to rounding at all angles.
 
     At |psi| = pi, where psi and -psi are the same rotation, the largest component of the result is positive if R is
-    exactly symmetric; otherwise rounding in R decides. Derivatives are right for changes of R that keep it a rotation:
-    d log(R exp(eps)) = T^-1(psi) d eps at eps = 0. At pi they are those of the result, towards smaller angles.
+    exactly symmetric; otherwise rounding in R decides. Derivatives are correct for changes of R that keep it a
+    rotation: d log(R exp(eps)) = T^-1(psi) d eps at eps = 0. At pi they are one-sided: the derivatives of the returned
+    branch, towards smaller angles.
 
-    From the quaternion q of R by the largest column of 4 q q^T (Bar-Itzhack, J. Guidance 23 (2000) 1085-1087).
+    The result is computed from the quaternion q of R, from the largest column of 4 q q^T (Bar-Itzhack, J. Guidance 23
+    (2000) 1085-1087).
 
     Args: R: a rotation, (3, 3).
     Returns: (3,), in rad.
-    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+    Raises: TypeError, ValueError: not an array of real numbers, or of another shape.
 
     >>> print(log(exp(jnp.array([0.0, 0.0, 3.0]))))
     [0. 0. 3.]
@@ -130,13 +132,15 @@ def log(R: Array) -> jax.Array:
 
 
 def tangent(psi: Array) -> jax.Array:
-    """T (3, 3) = I - c2 P + c3 P^2 for psi (3,), in rad: Om = T psidot is the rate of R0 exp(psi), for any constant R0.
+    """T (3, 3) = I - c2 P + c3 P^2 for psi (3,), in rad: Om = T psidot is the angular velocity of R0 exp(psi), for any
+    constant R0.
 
-    T^T takes moments from material components to those that work on psi. det T = 2 c2, so T is singular at 2 pi.
+    T^T maps moments in material components to the generalised forces conjugate to psi. det T = 2 c2, so T is singular
+    at 2 pi.
 
     Args: psi: (3,), in rad.
     Returns: (3, 3).
-    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+    Raises: TypeError, ValueError: not an array of real numbers, or of another shape.
 
     >>> psi = jnp.array([0.0, 0.0, 2.0])
     >>> print(tangent(psi) @ psi)                              # about a fixed axis, Om = psidot
@@ -150,11 +154,11 @@ def tangent(psi: Array) -> jax.Array:
 def inverse_tangent(psi: Array) -> jax.Array:
     """T^-1 (3, 3) = I + P/2 + d P^2 for psi (3,), in rad: psidot = T^-1 Om.
 
-    It grows without bound towards |psi| = 2 pi, where T is singular: there the result is inf, NaN or only rounding.
+    It grows without bound towards |psi| = 2 pi, where T is singular; there the result is inf, NaN or meaningless.
 
     Args: psi: (3,), in rad.
     Returns: (3, 3).
-    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+    Raises: TypeError, ValueError: not an array of real numbers, or of another shape.
 
     >>> psi = jnp.array([0.3, -0.2, 0.1])
     >>> print((inverse_tangent(psi) @ tangent(psi)).round(6) + 0.0)
@@ -167,13 +171,13 @@ def inverse_tangent(psi: Array) -> jax.Array:
 
 
 def tangent_rate(psi: Array, psidot: Array) -> jax.Array:
-    """Tdot psidot (3,), in rad/s^2, while psi (3,) changes by psidot (3,), in rad/s: Omdot = T psiddot + Tdot psidot.
+    """Tdot psidot (3,), in rad/s^2, for psi (3,) with the rate psidot (3,), in rad/s: Omdot = T psiddot + Tdot psidot.
 
         Tdot psidot = xdot (-dc2/dx P + dc3/dx P^2) psidot + c3 psidot x (psi x psidot),    xdot = 2 psi.psidot
 
     Args: psi: (3,), in rad. psidot: (3,), in rad/s.
     Returns: (3,), in rad/s^2.
-    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+    Raises: TypeError, ValueError: not an array of real numbers, or of another shape.
 
     >>> print(tangent_rate(jnp.zeros(3), jnp.array([1.0, 2.0, 3.0])))
     [0. 0. 0.]
@@ -186,14 +190,14 @@ def tangent_rate(psi: Array, psidot: Array) -> jax.Array:
 
 
 def orthonormalize(R: Array) -> jax.Array:
-    """R (3, 3) with its distance from the nearest rotation squared: one step R (3 I - R^T R)/2 of Newton and Schulz.
+    """R (3, 3) closer to a rotation: one step R (3 I - R^T R)/2 of Newton and Schulz, which squares the distance.
 
-    For products of many rotations, whose rounding errors add up. At a rotation, its derivative takes dR to the part
-    that is tangent to the rotations.
+    Use it for products of many rotations, whose rounding errors accumulate. At a rotation, its derivative projects dR
+    onto the tangent space of the rotations.
 
     Args: R: nearly a rotation, (3, 3).
     Returns: (3, 3).
-    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+    Raises: TypeError, ValueError: not an array of real numbers, or of another shape.
 
     >>> round(float(orthonormalize(1.01 * jnp.eye(3))[0, 0]), 4)
     0.9998
@@ -203,11 +207,12 @@ def orthonormalize(R: Array) -> jax.Array:
 
 
 def is_rotation(R, tolerance):
-    """Whether R (3, 3) has no entry of R^T R - I beyond the tolerance, and det R > 0; a boolean array, traceable.
+    """Whether all entries of R^T R - I are within the tolerance, and det R > 0, for R (3, 3); a boolean array,
+    traceable.
 
     Args: R: (3, 3). tolerance: a number.
     Returns: A boolean, as an array.
-    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+    Raises: TypeError, ValueError: not an array of real numbers, or of another shape.
 
     >>> bool(is_rotation(exp(jnp.ones(3)), 1e-6)), bool(is_rotation(-jnp.eye(3), 1e-6))
     (True, False)
@@ -219,11 +224,11 @@ def is_rotation(R, tolerance):
 
 
 def product(A: Array, B: Array) -> jax.Array:
-    """A B (3, 3) elementwise: XLA fuses it, and keeps float32 at full precision on every device.
+    """The matrix product A B (3, 3), elementwise: XLA can fuse it, and float32 keeps full precision on every device.
 
     Args: A, B: (3, 3).
     Returns: (3, 3).
-    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+    Raises: TypeError, ValueError: not an array of real numbers, or of another shape.
 
     >>> print(product(hat(jnp.array([1.0, 0.0, 0.0])), jnp.eye(3))[2])
     [0. 1. 0.]
@@ -237,11 +242,11 @@ def _product(A: Array, B: Array) -> Array:
 
 
 def cross(x: Array, y: Array) -> jax.Array:
-    """x cross y, for (3,) each; of scalars, which XLA fuses better than the gathers of jnp.cross.
+    """x cross y, for (3,) each; written with scalars, which XLA fuses better than the gathers of jnp.cross.
 
     Args: x, y: (3,).
     Returns: (3,).
-    Raises: TypeError, ValueError: no array of real numbers, or one of another shape.
+    Raises: TypeError, ValueError: not an array of real numbers, or of another shape.
 
     >>> print(cross(jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])))
     [0. 0. 1.]
@@ -258,7 +263,8 @@ _cross = Bilinear(_of_scalars, lambda z, y: _cross(y, z), lambda x, z: _cross(z,
 
 
 def inverse_coefficient(x: Array) -> Array:
-    """d = (c3 - 2 c4)/(2 c2) = (2 c2 - c1)/(2 c2 x): the one without cancellation at 0, the other at 2 pi."""
+    """d = (c3 - 2 c4)/(2 c2) = (2 c2 - c1)/(2 c2 x). The first form has no cancellation at 0, the second none at 2
+    pi."""
     c1, c2, c3, c4, _ = coefficients(x)
     small = x < 1
     return jnp.where(small, c3 - 2 * c4, (2 * c2 - c1) / jnp.where(small, 1, x)) / (2 * c2)
@@ -266,7 +272,8 @@ def inverse_coefficient(x: Array) -> Array:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _power_series(coefficients: tuple, x: Array) -> Array:
-    """Its derivatives are series too: through the recursion, each would be three times as long as the one before."""
+    """A power series whose derivatives are series too; differentiating its recursion would make each derivative three
+    times as long as the one before."""
     return reduce(lambda value, c: value * x + c, coefficients[-2::-1], jnp.full_like(x, coefficients[-1]))
 
 
@@ -284,7 +291,7 @@ def _polynomial(psi: Array, f: Array, g: Array) -> Array:
 
 
 def _real(caller: str, name: str, x: Array, shape: tuple) -> Array:
-    """x as an array of floats, if it is real and has this shape; checked while tracing."""
+    """x as an array of floats; raises an error unless it is real and has this shape. Checked while tracing."""
     if not is_array(x) or not is_real(x):
         raise TypeError(f"{caller}: `{name}` must be an array of real numbers; received {x!r}.")
     if x.shape != shape:
@@ -314,7 +321,7 @@ def coefficients(x: Array):
 
 
 def members(n: int, x: Array):
-    """c1, ..., cn: power series and recursion down for x < NEAR, definitions and recursion up beyond.
+    """c1, ..., cn: for x < NEAR from power series and recursion downwards, else from definitions and recursion upwards.
 
     >>> len(members(7, jnp.array(1.0)))
     7

@@ -1,8 +1,9 @@
-"""Sine and cosine by polynomials: for arrays outside of kernels, which XLA then vectorises on the CPU.
+"""Sine and cosine by polynomials, for arrays outside of kernels, which XLA can then vectorise on the CPU.
 
-XLA:CPU evaluates `jnp.sin` of float64 numbers one by one, at some 5 ns each. These are sums and products, 2 ns for sine
-and cosine together. Inside a kernel `jnp.sin` and `jnp.cos` are such polynomials anyway (`hhtjax.xla`); where a system
-is too large for one, put these in their place in `mass` and `force`; the module as a whole can stand where `jnp` does
+XLA:CPU evaluates `jnp.sin` of float64 numbers one by one, at some 5 ns each. These functions are sums and products,
+which take 2 ns for sine and cosine together. Inside a kernel `jnp.sin` and `jnp.cos` are such polynomials anyway
+(`hhtjax.xla`). If a system is too large for a kernel, use these functions in its `mass` and `force`. A function that
+takes its sine and cosine from a module can use this module instead of `jnp`
 (`hhtjax.scenes.double_pendulum.stiff(trigonometry=hhtjax.trigonometry)`).
 
 >>> import jax.numpy as jnp
@@ -37,9 +38,9 @@ def sincos(x: Array) -> tuple[jax.Array, jax.Array]:
 
     with pi/2 in three parts (Cody, Waite 1980) and S, C of degree 5.
 
-    In float64 the error is below 2 units in the last place of the result for |x| <= 1e5, and the result NaN beyond:
-    wrap angles that turn further. In float32, which XLA vectorises itself, they are `jnp.sin` and `jnp.cos`. Integers
-    become the default float type. Derivatives, of any order, are made of the same two values.
+    In float64 the error is below 2 units in the last place of the result for |x| <= 1e5. Beyond that the result is NaN:
+    wrap larger angles. In float32, which XLA vectorises itself, they are `jnp.sin` and `jnp.cos`. Integers become the
+    default float type. Derivatives of any order consist of the same two values.
 
     Args: x: rad, an array of any shape.
     Returns: (sin x, cos x), each shaped like x.

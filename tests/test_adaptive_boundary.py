@@ -51,7 +51,9 @@ def test_traced_times_that_do_not_increase_are_named():
 
     for times in TIMES:
         found = at(times)
-        with pytest.raises(hhtjax.SimulationError, match="`times` must increase, and lie after t0; with it they were"):
+        with pytest.raises(
+            hhtjax.SimulationError, match="`times` must increase, and lie after t0; with t0 in front they were"
+        ):
             found.check()
         known = np.isfinite(found.q[1:, 0])
         assert not known[~(times > 0)].any()

@@ -43,7 +43,7 @@ def test_dtypes_of_mass_and_force_are_checked(name, dtype):
     def force(q, v, t, params):
         return jnp.ones(1, dtype if name == "force" else q.dtype)
 
-    message = f"simulate: `{name}` returned {dtype} for a state of float64; give params, and arrays made inside"
+    message = f"simulate: `{name}` returned {dtype} for a state of float64. Give params, and arrays made inside"
     check_message(TypeError, message, lambda: run(System(mass, force)))
 
 
@@ -62,7 +62,7 @@ def test_a_double_result_for_a_single_state_is_named(name):
         return -params["force"] * q.astype(params["force"].dtype)
 
     params = {"mass": SINGLE, "force": SINGLE, name: ONE}
-    message = f"simulate: `{name}` returned float64 for a state of float32; give params"
+    message = f"simulate: `{name}` returned float64 for a state of float32. Give params"
     with pytest.warns(PrecisionWarning), pytest.raises(TypeError, match=re.escape(message)):
         run(System(mass, force), q0=SINGLE, v0=0 * SINGLE, params=params)
 
@@ -106,13 +106,13 @@ def test_an_error_inside_mass_or_force_keeps_its_kind_and_says_where(name):
 @pytest.mark.parametrize(
     ("arguments", "note"),
     [
-        ({"q0": [1.0], "v0": [0.0]}, "`q0` is a list of numbers, which to JAX is no array but a container of 1: if an"),
-        ({"q0": [1.0, 2.0], "v0": [0.0, 0.0]}, "`v0` is a list of numbers, which to JAX is no array but a container"),
+        ({"q0": [1.0], "v0": [0.0]}, "`q0` is a list of numbers. JAX treats it as a container of 1"),
+        ({"q0": [1.0, 2.0], "v0": [0.0, 0.0]}, "`v0` is a list of numbers. JAX treats it as a container"),
         (
             {"params": {"k": (1.0, 2.0)}},
-            "`params['k']` is a tuple of numbers, which to JAX is no array but a container",
+            "`params['k']` is a tuple of numbers. JAX treats it as a container",
         ),
-        ({"params": None}, "`params` was left out, so that the functions of the system received None."),
+        ({"params": None}, "`params` was left out, so the functions of the system received None."),
     ],
 )
 def test_lists_of_numbers_and_missing_params_are_named(arguments, note):

@@ -81,7 +81,7 @@ def test_so_are_those_of_other_functions_and_any_other_names_pass():
         TypeError, match=re.escape("constraint(q, t, params); received one with the arguments (t, q, p)")
     ):
         System(np.ones(2), pull, lambda t, q, p: q[:1])
-    with pytest.raises(TypeError, match=r"arguments \(q, v, t, p\)\. Velocities that are held, .* are `sliding` with"):
+    with pytest.raises(TypeError, match=r"arguments \(q, v, t, p\)\. For a velocity constraint, .* use `sliding` with"):
         System(np.ones(2), pull, lambda q, v, t, p: v[:1])
     with pytest.raises(TypeError, match=re.escape("rate(y, t, params); received one with the arguments (t, y, p)")):
         hhtjax.FirstOrderSystem(lambda t, y, p: y)
@@ -190,7 +190,7 @@ ENDS = {"Unhashable()": "Make it a pytree"}
     ],
 )
 def test_params_are_numbers_or_functions(value, received, what):
-    end = ENDS.get(received, "What is none of them")
+    end = ENDS.get(received, "Put other values into")
     message = f"`params['k'][1]` must be {what}; received {received}. {end}"
     for call in (
         lambda params: run(System(np.ones(2), pull), params=params),
@@ -237,7 +237,7 @@ def test_a_gradient_that_is_rounding_is_none():
         return jnp.stack([q[0] - 1, jnp.sin(0.3 * q[1]) ** 2 + jnp.cos(0.3 * q[1]) ** 2 - 1 + 1e-16 * (q[0] - 1)])
 
     with pytest.raises(
-        ValueError, match=r"`constraint` rows \[1\] have no gradient in q at the start but for rounding"
+        ValueError, match=r"`constraint` rows \[1\] have no gradient in q at the start \(only rounding\)"
     ):
         run(System(np.ones(2), pull, constraint))
 

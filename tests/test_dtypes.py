@@ -46,7 +46,7 @@ def test_float32_stays_float32_and_warns_once_a_call(name):
     late, _ = run_and_catch(
         stepper=with_tolerance(STEPPERS[name], 1e-5), q0=SINGLE, v0=0 * SINGLE, save_every=2, t0=1e8
     )
-    with pytest.raises(hhtjax.SimulationError, match=r"times are alike in float32, near t = 1e\+08: count from a t0"):
+    with pytest.raises(hhtjax.SimulationError, match=r"times are equal in float32, near t = 1e\+08: count from a t0"):
         late.check()
 
 

@@ -137,7 +137,7 @@ ERRORS = {
                  lambda: call([Event(lambda q, v, t, p: jnp.ones(2) * q[0])])),
     "arguments": (TypeError, "events[0]: `guard` must be a function guard(q, v, t, params)",
                   lambda: call([Event(lambda t: t)])),
-    "a stepper": (NotImplementedError, "KimHHT cannot begin anew behind an event",
+    "a stepper": (NotImplementedError, "KimHHT does not support events",
                   lambda: call([HEIGHT], stepper=hhtjax.kim_hht(0.0))),
     "beyond": (ValueError, "the start is beyond the guard of events[1]: it is -1, with the rate 0",
                lambda: call([HEIGHT, Event(lambda q, v, t, p: q[0] - 2.0, impact(0.5))])),
@@ -186,7 +186,9 @@ def test_a_traced_start_beyond_the_guard_is_named():
 
     run = jax.jit(end)(-ONE)
     check_message(
-        hhtjax.SimulationError, "step 1 (to t = 0.1) failed: the motion stays beyond the guard of event 0", run.check
+        hhtjax.SimulationError,
+        "step 1 (to t = 0.1) failed: the guard stays negative, because nothing turned the motion back, at event 0",
+        run.check,
     )
 
 
@@ -195,5 +197,5 @@ def test_a_guard_that_its_switch_makes_negative_is_named():
     """A threshold that moves away by more than the motion, where it should have moved ahead of it."""
     passing = Event(lambda q, v, t, p: p["level"] - q[0], switch=lambda p: {"level": p["level"] - 1.0})
     run = call([passing], stepper=rk4(), v0=ONE, params={"level": 1.25})
-    message = "step 3 (to t = 0.3) failed: behind an event, with the params of its switch and the v of its reset, "
-    check_message(hhtjax.SimulationError, message + "negative is the guard of event 0. Guards are positive", run.check)
+    message = "step 3 (to t = 0.3) failed: after the switch and the reset of an event a guard is negative, "
+    check_message(hhtjax.SimulationError, message + "that of event 0. Guards must be positive", run.check)

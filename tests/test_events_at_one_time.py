@@ -47,5 +47,5 @@ def test_a_guard_that_an_impact_throws_back_fails_by_name():
     floor, rebound = Event(lambda q, v, t, p: q[0], impact("e")), Event(lambda q, v, t, p: -v[0], terminal=True)
     params, events = {"g": G, "e": 0.8}, [floor, rebound]
     run = simulate(ball, LIGHT, jnp.ones(1), -jnp.ones(1), params, dt=0.9, num_steps=1, events=events)
-    message = "step 1 (to t = 0.9) failed: what another event changes takes the motion at once beyond the guard"
+    message = "step 1 (to t = 0.9) failed: another event made a guard negative at once"
     check_message(SimulationError, message, run.check)

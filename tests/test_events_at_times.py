@@ -227,7 +227,7 @@ def test_times_that_do_not_increase_are_named_under_jit_too():
         return loaded(T)
 
     unsorted = np.array([0.0, 0.5, 0.3, 0.6, 0.7, 0.8, 0.9])
-    message = "step 1 (to t = 0.1) failed: q and v are numbers, but not the guard of event 0"
+    message = "step 1 (to t = 0.1) failed: q and v are finite, but the guard is NaN at event 0"
     check_message(hhtjax.SimulationError, message, jax.jit(end)(unsorted).check)
     check_message(ValueError, "simulate: events[0]: `at` must hold numbers in increasing order", lambda: end(unsorted))
 
@@ -244,7 +244,7 @@ ERRORS = {
                  lambda: Event(at=[2.0, 1.0])),
     "no number": (ValueError, "Event: `at` must hold numbers in increasing order; received nan.",
                   lambda: Event(at=np.nan)),
-    "an impact": (TypeError, "Event: an impact needs the direction of a `guard`; received one with `at`.",
+    "an impact": (TypeError, "Event: an impact needs the direction of a `guard`; received `at` without one.",
                   lambda: Event(at=1.0, reset=impact(0.5))),
     "arguments": (TypeError, "Event: `at` is called as at(params); received a function of 2 positional",
                   lambda: Event(at=lambda p, q: 1.0)),

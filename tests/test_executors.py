@@ -211,7 +211,7 @@ def test_sweeps_of_float32_cross(threads, tmp_path):
 
 def test_what_files_cannot_hold_is_refused(tmp_path):
     for f, error, words in (
-        (lambda x: {"a": {"b": x}, "a.b": x}, ValueError, "must have names of their own"),
+        (lambda x: {"a": {"b": x}, "a.b": x}, ValueError, "must have unique names"),
         (lambda x: {"file": x}, ValueError, "received 'file'"),
         (lambda x: {"a/b": x}, ValueError, "received 'a/b'"),
         (lambda x: x.astype(jnp.bfloat16), TypeError, "must be of a dtype of NumPy; received bfloat16"),
@@ -239,7 +239,7 @@ def test_what_cannot_be_mapped_is_refused():
             hhtjax.parallel_map(*arguments, **({"chunk": 2} | options))
 
     refused("`f` must be a function of one member's arguments; received 3", 3, K, error=TypeError)
-    refused("give `arguments` behind `f`", jnp.sin, error=TypeError)
+    refused("give `arguments` after `f`", jnp.sin, error=TypeError)
     refused("must be pytrees of arrays and numbers; received 'a'", jnp.sin, "a", error=TypeError)
     refused("leading axes of one length, not 0, where `in_axes` is 0", jnp.add, K, K[:3])
     refused("leading axes of one length, not 0", jnp.sin, 1.0)
@@ -249,7 +249,7 @@ def test_what_cannot_be_mapped_is_refused():
     refused("must return arrays of numbers; received keys", jax.random.key, np.arange(3), error=TypeError)
     refused("must be pytrees of arrays and numbers", jnp.sin, np.array([None, 1]), error=TypeError)
     refused("`f` must be hashable; received Unhashable", Unhashable(), K, error=TypeError)
-    with pytest.raises(TypeError, match="must be known: call it outside jit"):
+    with pytest.raises(TypeError, match="must not be tracers: call it outside jit"):
         jax.jit(lambda x: hhtjax.parallel_map(jnp.sin, x, chunk=2))(K)
 
 
@@ -300,7 +300,7 @@ def test_what_fails_is_tried_again_and_then_named():
     assert raised.value.__cause__ is no_room
     with pytest.raises(RuntimeError, match="members 0 to 2 failed 1 times"):
         hhtjax.parallel_map(jnp.sin, K, chunk=3, executor=Failing(1, no_room), retries=0)
-    with pytest.raises(RuntimeError, match="a worker died at members 0 to 2, or beside them"):
+    with pytest.raises(RuntimeError, match="a worker died at members 0 to 2, or at members next to them"):
         hhtjax.parallel_map(jnp.sin, K, chunk=3, executor=Failing(1, BrokenProcessPool("gone")))
 
 
@@ -414,7 +414,9 @@ def test_another_chunk_in_a_chunks_place_is_noticed(tmp_path):
     folder = written(tmp_path / "sweep")
     before = contents(folder)
     shutil.copy(folder / "chunk-00000.npz", folder / "chunk-00001.npz")
-    with pytest.raises(ValueError, match=r"chunk-00001\.npz is damaged \(another chunk's, or another sweep's\)"):
+    with pytest.raises(
+        ValueError, match=r"chunk-00001\.npz is damaged \(it belongs to another chunk or another sweep\)"
+    ):
         hhtjax.load_sweep(folder)
     written(folder)
     assert contents(folder) == before

@@ -266,7 +266,9 @@ def test_a_start_that_is_not_what_is_held(name):
     how, t0, rate, off = STARTS[name]
     system, q0, v0 = chain(9, held={0: how})
     start = q0.at[0, 0].add(off), v0.at[0, 0].set(rate)
-    with pytest.raises(ValueError, match=rf"simulate: `{name[:2]}` of node 0 must be what `held` gives at the start"):
+    with pytest.raises(
+        ValueError, match=rf"simulate: `{name[:2]}` of node 0 must be what `held` prescribes at the start"
+    ):
         hhtjax.simulate(system, hhtjax.hht(), *start, PARAMS, dt=0.01, num_steps=1, t0=t0)
     sweep = {"dts": jnp.array([0.01]), "duration": 0.1, "num_samples": 1}
     with pytest.raises(ValueError, match=rf"sweep: `{name[:2]}` of node 0 must be"):
@@ -382,16 +384,16 @@ def off(name):
 
 
 WRONG = {
-    "node": r"Elements: `nodes` names node 3, and a leaf of the state has shape \(3, 2\)",
+    "node": r"Elements: `nodes` contains node 3, but a leaf of the state has shape \(3, 2\)",
     "force": r"`function` must return a force .* of shapes \(2, 2\); received \(2,\)",
     "joint": r"Joints: `function` must return the rows \(m,\) of one joint; received shape \(\)",
-    "set": "Elements: `nodes` must be an array, as the position is no dict; received the keys",
+    "set": "Elements: `nodes` must be an array, because the position is not a dict; received the keys",
     "each": r"Elements: `each\['k'\]` must be a number, or have one row for each .* received shape \(3,\)",
     "mass": r"a leaf of `mass` must .* of shape \(3, 2\); received shape \(5,\)",
     "mass of a key": r"`mass` must be structured like v, or have shape \(6,\); received",
-    "held node": r"`held` names node 3, and a leaf of the state has shape \(3, 2\)",
+    "held node": r"`held` names node 3, but a leaf of the state has shape \(3, 2\)",
     "held flags": r"booleans of `held` must have the shape \(2,\) of their nodes; received shape \(3,\)",
-    "held shape": r"what `held` gives of \(0,\) must have their shape \(2,\); received shape \(3,\)",
+    "held shape": r"the result of `held` for \(0,\) must have their shape \(2,\); received shape \(3,\)",
     "nodes": r"Elements: `nodes` must be an array \(E, k\) of integers",
     "large nodes": r"Elements: `nodes` must be an array \(E, k\) of integers",
     "rows of each": r"Elements: `each` must be a number, or have one row for each of the 2 rows",
@@ -402,7 +404,7 @@ WRONG = {
     "function": r"Elements: `function` is called as function\(q, v, t, params\); received a function of 1",
     "function with each": r"is called as function\(q, v, t, params, each\); received a function of 4",
     "mass function": r"`mass` is called as mass\(q, w, params\); received a function of 4",
-    "two masses": "`mass` must hold one part that sits at nodes, and Elements; received",
+    "two masses": "`mass` must hold one mass at the nodes, and Elements; received",
 }
 
 

@@ -100,13 +100,13 @@ REFUSED = {
         lambda: hhtjax.simulate(maxwell(5.0), hhtjax.hht(), Q0, V0, held(), dt=0.1, num_steps=3),
         "leave out held inputs",
     ),
-    "an ode": (lambda: hhtjax.interop.ode(maxwell(5.0)), "coordinates without mass"),
-    "springs alone": (lambda: hhtjax.LinearSystem(M, None, K), "has to be damped"),
+    "an ode": (lambda: hhtjax.interop.ode(maxwell(5.0)), "Coordinates without mass"),
+    "springs alone": (lambda: hhtjax.LinearSystem(M, None, K), "must be damped"),
     "one of two nodes damped": (
         lambda: hhtjax.LinearSystem(np.diag([1.0, 0, 0]), np.diag([0.0, 5, 0]), np.eye(3)),
-        "has to be damped",
+        "must be damped",
     ),
-    "a negative damper": (lambda: maxwell(-5.0), "has to be damped"),
+    "a negative damper": (lambda: maxwell(-5.0), "must be damped"),
 }  # fmt: skip
 
 

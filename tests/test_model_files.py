@@ -373,7 +373,7 @@ def test_rotors_of_all_motors_count_and_gears_are_their_own():
 
 def test_what_a_caller_adds_acts_too():
     """A range that the file does not have; the effort of a URDF, where there are motors."""
-    with pytest.raises(ValueError, match="say what they do"):
+    with pytest.raises(ValueError, match="give limits="):
         bodies.load(in_world(), joints={"j": {"range": (-1, 1)}})
     with pytest.raises(NotImplementedError, match=r"(?s)actuatorfrcrange: shoulder"):
         bodies.load(URDF, ignore=("contact",), limits="ignore", motors=[bodies.Motor("shoulder")])

@@ -221,13 +221,15 @@ def test_lines_join_outputs(short):
 
 
 def test_a_run_without_its_path_is_refused_by_name(short):
-    with pytest.raises(ValueError, match="check: leave `reach` out: the run has kept its output, and no q"):
+    with pytest.raises(ValueError, match="check: leave `reach` out: the run saved `output` only, and no q"):
         short.check(reach=1.0)
     with pytest.raises(ValueError, match="energy_balance: `solution` must have q and v; received a run with output="):
         hhtjax.analysis.energy_balance(SPRING, short, START[2])
     with pytest.raises(ValueError, match="measure: leave `output` out: the run was made with one"):
         hhtjax.measure(short, 0.1, output=lambda q: q)
-    with pytest.raises(NotImplementedError, match="interpolate: nothing is known of the output of a run at its events"):
+    with pytest.raises(
+        NotImplementedError, match="interpolate: the output of a run with events is unknown at its events"
+    ):
         hhtjax.interpolate(short._replace(events=short.t), 0.1)
     assert "output.q" in str(short)
 

@@ -111,7 +111,10 @@ def test_a_batch_and_a_sweep_say_how_many():
         (run(failed=3, quantity=4).failure, "Failure(the internal state z is not finite, step=3"),
         (run(failed=3, newton=True).failure, "Failure(Newton did not converge, step=3, newton=True, quantity=1)"),
         (run(failed=3).failure._replace(row=jnp.asarray(2)), "Failure(a constraint depends on others, step=3, "),
-        (run(failed=3).failure._replace(solve=jnp.asarray(0.1)), "Failure(the linear solve left too much, step=3, "),
+        (
+            run(failed=3).failure._replace(solve=jnp.asarray(0.1)),
+            "Failure(the linear solve has too large a residual, step=3, ",
+        ),
         (run().failure, "Failure(no step failed, step=0, newton=False, quantity=1)"),
         (Interpolant(jnp.ones((2, 1)), None), "Interpolant(q=float64[2,1])"),
         (

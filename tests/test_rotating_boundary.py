@@ -37,7 +37,7 @@ def test_bad_input():
             lambda: simulate(stepper=hhtjax.rk4()),
         ),
         (NotImplementedError, "KimHHT cannot move", lambda: simulate(stepper=hhtjax.kim_hht())),
-        (NotImplementedError, "need a System(mass, force)", lambda: simulate(system=hhtjax.LinearSystem(jnp.ones(3)))),
+        (NotImplementedError, "write a System(mass, force)", lambda: simulate(system=hhtjax.LinearSystem(jnp.ones(3)))),
         (
             NotImplementedError,
             "from_lagrangian",

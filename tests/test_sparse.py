@@ -214,7 +214,7 @@ def full(p):
          lambda: run(LinearSystem(hhtjax.sparse(M), nonlinear=stop), hhtjax.hht())),
         (NotImplementedError, "simulate: leave out `friction` beside sparse matrices",
          lambda: run(LinearSystem(hhtjax.sparse(M), friction=lambda q, v, t, p: 0 * q), hhtjax.hht())),
-        (NotImplementedError, "Houbolt cannot keep the matrices of the system sparse",
+        (NotImplementedError, "Houbolt does not support sparse matrices",
          lambda: run(SPARSE[False], hhtjax.houbolt())),
         (NotImplementedError, "hht: leave out `solve` with sparse matrices",
          lambda: run(SPARSE[False], hhtjax.hht(solve=jnp.linalg.solve))),

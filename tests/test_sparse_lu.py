@@ -129,7 +129,7 @@ def test_what_is_wrong_is_named():
         hhtjax.sparse_lu(np.ones((3, 4)))
     with pytest.raises(ValueError, match=r"sparse_lu: `tolerance` must be positive; received -1"):
         hhtjax.sparse_lu(tolerance=-1.0)
-    with pytest.raises(ValueError, match=rf"sparse_lu: `pattern` must have shape \({N}, {N}\), as v has numbers"):
+    with pytest.raises(ValueError, match=rf"sparse_lu: `pattern` must have shape \({N}, {N}\), for the numbers in v"):
         run(SCENES["springs"], hhtjax.sparse_lu(np.eye(3)))
 
 

@@ -148,7 +148,7 @@ def test_a_full_disk_is_an_error_and_loses_nothing(whole, tmp_path):
     previous = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))  # the manifest fits, a chunk does not
     try:
-        with pytest.raises(OSError, match=r"chunk-00000\.npz could not be written .*; the files before it") as raised:
+        with pytest.raises(OSError, match=r"chunk-00000\.npz could not be written .*; earlier files are") as raised:
             write(folder)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -174,7 +174,9 @@ def test_traced_times_that_do_not_increase_and_step_sizes_that_are_negative_are_
     runs = broken_runs(np.array(times), np.array([0.02, -1.0]))
     np.testing.assert_array_equal(np.isfinite(runs.q[0, :, 0]), np.arange(6) <= good)
     np.testing.assert_array_equal(runs.failure.step, [np.rint((times[good - 1] - 2) / 0.02) + 1, 1])
-    with pytest.raises(hhtjax.SimulationError, match="`times` must increase, and lie after t0; with it they were"):
+    with pytest.raises(
+        hhtjax.SimulationError, match="`times` must increase, and lie after t0; with t0 in front they were"
+    ):
         runs.check()
 
 

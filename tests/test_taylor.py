@@ -216,7 +216,7 @@ def test_bad_orders_and_tolerances_are_told():
         hhtjax.taylor(order=2.5)
     with pytest.raises(ValueError, match="taylor: give `order`"):
         hhtjax.simulate(spring, hhtjax.taylor(), *start, dt=0.1, num_steps=2)
-    with pytest.raises(ValueError, match="where the tolerance is traced"):
+    with pytest.raises(ValueError, match="if the tolerance is traced"):
         jax.jit(
             lambda tol: hhtjax.simulate(spring, hhtjax.taylor(), *start, dt=hhtjax.adaptive(tol, tol), times=[1.0])
         )(1e-6)

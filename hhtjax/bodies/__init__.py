@@ -1,7 +1,7 @@
-"""Mechanisms from bodies and joints, or from model files: their equations in minimal coordinates as a `System`.
+"""Mechanisms from bodies and joints, or from model files, as a `System` in minimal coordinates.
 
-A body hangs on its parent by joints; each joint brings its own coordinates, and nothing else moves. A rod on a motor,
-driven to an angle:
+Joints connect a body to its parent. Each joint adds its own coordinates; there are no others. Example: a rod on a motor
+that is driven to an angle:
 
 >>> import jax.numpy as jnp, hhtjax
 >>> from hhtjax.bodies import Body, Joint, Motor, tree
@@ -15,13 +15,14 @@ driven to an angle:
 -0.49
 
 All numbers of a mechanism are in `params`, a dict of arrays: they can be fitted, differentiated, and run in batches.
-Places and axes are part of the program, because known zeros make it fast; `free=("position",)` makes places data.
+The exception are positions and axes. They are part of the program, because known zeros make it fast;
+`free=("position",)` puts positions into params.
 
 From a file
 -----------
 
-`load` reads MJCF and URDF, by the package mujoco (`pip install "hhtjax[models]"`). What acts in the file and is not
-modelled here is refused in one list, unless you ignore it by name:
+`load` reads MJCF and URDF files, with the package mujoco (`pip install "hhtjax[models]"`). If the file contains
+features that are not modelled here, an error lists all of them. Pass their names to ignore them:
 
 >>> from hhtjax import bodies
 >>> pendulum = bodies.load('''<mujoco><worldbody><body name="rod"><joint name="pivot" axis="0 1 0"/>
@@ -33,8 +34,8 @@ Mechanism(1 bodies, 1 rates, 0 motors)
 Friction from a record
 ----------------------
 
-From encoders and motor torques to dry friction with its 95 % interval, by `equation_error`, which simulates nothing.
-The record is made up here, with 1.5 and 0.7 N m and noise:
+`equation_error` estimates dry friction with its 95 % interval from encoders and motor torques, without simulation. The
+record in this example is generated, with 1.5 and 0.7 N m and noise:
 
 >>> import jax, numpy as np
 >>> arm = bodies.load('''<mujoco><worldbody><body name="upper">
@@ -60,28 +61,28 @@ elbow: 0.696 N m, 0.688 to 0.704
 Coordinates
 -----------
 
-q and v are arrays (n,) where there are hinges and slides only: `Mechanism.index` gives the place of a joint. Otherwise
-q is a dict: "ball", rotation matrices (., 3, 3) from the body to its parent; "free", with "R" (., 3, 3) and "x" (., 3)
-in the world; "joint", hinges and slides. v has material angular velocities (., 3) in the place of matrices.
-Motors with an activation add internal states: start runs with `z0=robot.z0`, which is None without.
+q and v are arrays (n,) if there are only hinges and slides; `Mechanism.index` gives the place of a joint in them.
+Otherwise q is a dict: "ball" has rotation matrices (., 3, 3) from the body to its parent; "free" has "R" (., 3, 3) and
+"x" (., 3) in the world; "joint" has hinges and slides. v has material angular velocities (., 3) instead of matrices.
+Motors with an activation add internal states: start runs with `z0=robot.z0`, which is None if there are none.
 
 Loops
 -----
 
-`Connect`, `Weld` and `Couple` close loops of a tree, as constraints of the system. Rows that only repeat what others
-say are left out when the mechanism is made: a pin in the plane has three rows, and two that count.
+`Connect`, `Weld` and `Couple` close loops of a tree, by constraints of the system. Redundant rows are removed when the
+mechanism is made: of the three rows of a pin in a plane, two remain.
 
-What gives way
---------------
+Flexible links and gears
+------------------------
 
-`flexible` puts a spring behind the gear of a motor, `beam` makes a link of rigid pieces with springs between them. Both
-are joints with `stiffness`, which is in params: it can be fitted. Stiff springs ask for no small steps.
+`flexible` puts a spring behind the gear of a motor. `beam` divides a link into rigid pieces with springs between them.
+Both use joints with `stiffness`, which is in params and can be fitted. Stiff springs do not require small steps.
 
 How it is computed
 ------------------
 
-A step calls one function, the inverse dynamics less the forces that act (`System(dynamics=)`). Its slopes in q, v and w
-are known in closed form, and autodiff uses them: see `hhtjax/bodies/newton_euler.py`.
+A step calls one function, the inverse dynamics minus the forces that act (`System(dynamics=)`). Its derivatives with
+respect to q, v and w are known in closed form, and autodiff uses them: see `hhtjax/bodies/newton_euler.py`.
 """
 
 from hhtjax.bodies.beam import beam

@@ -1,7 +1,7 @@
-"""What users give to the functions of a mechanism: positions, rates and params of the right shapes, or an error.
+"""Checks of the arguments of a mechanism's functions: the shapes of positions, rates and params.
 
-Shapes are known while a program is traced, so this costs nothing when it runs. Without it a number too few would be
-broadcast, and the result wrong without a word.
+Shapes are known while a program is traced, so the checks cost nothing at run time. Without them an array of a wrong
+shape would be broadcast, and the result silently wrong.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ SIMILAR = 0.8  # from which on a name is a misspelling of another
 
 
 def require_position(tree: Tree, q: PyTree):
-    """An error for q of another shape."""
+    """Raises an error for q of another shape."""
     _require("q", q, _shapes(tree, (3, 3)))
 
 
 def require_rates(tree: Tree, name: str, v: PyTree):
-    """The same for v, w, and a torque; name: of the argument."""
+    """Raises an error for v, w or a torque of another shape; name: of the argument."""
     _require(name, v, _shapes(tree, (3,)))
 
 
 def require_activations(model: Model, z: PyTree):
-    """The same for z."""
+    """Raises an error for z of another shape."""
     number = len(model.activated)
     if number:
         _require("z", z, (number,))
@@ -39,9 +39,10 @@ def require_activations(model: Model, z: PyTree):
 
 
 def require_params(model: Model, params: PyTree):
-    """An error for entries of another shape, for what would be ignored, and for names that look misspelt.
+    """Raises an error for entries of another shape, for entries that would be ignored, and for names that look
+    misspelt.
 
-    Other names pass: a force of the user's own may read them.
+    Other names pass, because the user's own forces may read them.
     """
     if not isinstance(params, dict):
         raise TypeError(f"params must be a dict, as `Mechanism.params`; received {type(params).__name__}.")
@@ -63,7 +64,7 @@ UNREAD = {
     "position": 'make the mechanism with free=("position",).',
     "ctrl": "the mechanism has no motors.",
     "timeconst": "no motor of the mechanism is a filter.",
-    "frictionloss": 'no joint rubs. Make the mechanism with `friction` of a joint above 0, and with friction="dry".',
+    "frictionloss": 'no joint has friction: give a joint `friction` > 0, and the mechanism friction="dry".',
     "stop_stiffness": 'make the mechanism with limits="stop", and joints with a `range`.',
     "stop_damping": 'make the mechanism with limits="stop", and joints with a `range`.',
     "spring_stiffness": "no ball and no free joint has a `stiffness`.",
@@ -72,7 +73,7 @@ UNREAD = {
 
 
 def entries(model: Model) -> dict[str, tuple | None]:
-    """The shape of each entry of params; None: not read."""
+    """The shape of each entry of params; None for an entry that is not read."""
     tree, bodies, motors = model.tree, len(model.bodies), len(model.drives)
     filters = any(drive.activation == "filter" for drive in model.drives)
 
@@ -118,7 +119,7 @@ def _shapes(tree: Tree, of_rotation: tuple) -> PyTree:
 
 
 def _require(name: str, value: PyTree, expected: PyTree):
-    """An error for a value that is not of these shapes."""
+    """Raises an error for a value that does not have these shapes."""
     if isinstance(expected, dict):
         if not isinstance(value, dict) or set(value) != set(expected):
             words = ", ".join(repr(key) for key in expected)
@@ -131,7 +132,7 @@ def _require(name: str, value: PyTree, expected: PyTree):
 
 
 def require_shape(name: str, value: PyTree, expected: tuple):
-    """An error for what is no array of this shape."""
+    """Raises an error unless it is an array of this shape."""
     try:
         shape = jnp.shape(value)
     except TypeError:

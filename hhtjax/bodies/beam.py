@@ -1,4 +1,4 @@
-"""Flexible links: a uniform beam as rigid pieces with springs between them, bodies for `tree`."""
+"""Flexible links: a uniform beam as rigid pieces with springs between them, as bodies for `tree`."""
 
 from __future__ import annotations
 
@@ -28,32 +28,33 @@ def beam(
     position: Any = (0.0, 0.0, 0.0),
     rotation: Any = (1.0, 0.0, 0.0, 0.0),
 ) -> list[Body]:
-    """A flexible link along x: a uniform beam, divided into rigid pieces that springs join.
+    """A flexible link along x: a uniform beam, divided into rigid pieces joined by springs.
 
-    Each element, of length h = length/elements, is two rigid halves with springs in its middle. Halves of neighbours
-    are one piece. With the angles of a spring, about y and z of bending and about x of twist,
+    Each element, of length h = length/elements, consists of two rigid halves with springs in the middle. Adjacent
+    halves of neighbouring elements form one piece. Springs bend about y and z, and twist about x:
 
         moment = k (angle + damping d(angle)/dt),    k = EI/h or GJ/h
 
-    Errors fall as 1/elements^2. A tip force F bends the clamped beam by F L^3/(3 EI) (1 - 1/(4 elements^2)). Its
-    frequencies are too high: the first by 1.5 % with 4 elements and by .36 % with 8, the second by 5.2 % and 1.3 %.
-    Angles may be large in all, and are small from piece to piece. Shear and extension are left out.
+    Errors fall as 1/elements^2. A tip force F bends the clamped beam by F L^3/(3 EI) (1 - 1/(4 elements^2)).
+    Frequencies are too high: the first by 1.5 % with 4 elements and by .36 % with 8, the second by 5.2 % and 1.3 %. The
+    total rotation may be large; the angle of each spring must be small. Shear and extension are neglected.
 
     Args:
-        name: of the beam. Pieces are NAME1, ..., NAME(elements + 1); the frame of each is at its beginning. NAME_tip is
-            a frame at the end, to hang further bodies on. The joints between them are NAME2_z, NAME2_y, NAME2_x, ...
-        length: m. elements: how many, 1 or more.
+        name: name of the beam. Its pieces are NAME1, ..., NAME(elements + 1); the frame of each is at its beginning.
+            NAME_tip is a frame at the end, to which further bodies can be attached. The joints between them are
+            NAME2_z, NAME2_y, NAME2_x, ...
+        length: m. elements: their number, 1 or more.
         EI: bending stiffness, N m^2: one number, or (about y, about z), with None for a direction that does not bend.
         rhoA: mass per length, kg/m.
         GJ: torsional stiffness, N m^2; None for a beam that does not twist.
-        rhoI: moment of inertia of the section per length, kg m: one number, or (about y, about z). Their sum is that
-            about x, which a beam that twists must have.
-        damping: of the material, s: the moment of a rate of strain, divided by that of a strain. A mode of frequency f
-            has the damping ratio pi f damping.
-        parent, position, rotation: where it begins, as in `Body`. joints: of the first piece, as in `Body`.
+        rhoI: moment of inertia of the cross-section per length, kg m: one number, or (about y, about z). Their sum is
+            the moment about x, which must be positive for a beam that twists.
+        damping: of the material, s: the ratio of viscous to elastic modulus. A mode of frequency f has the damping
+            ratio pi f damping.
+        parent, position, rotation: where the beam begins, as in `Body`. joints: of the first piece, as in `Body`.
 
     Returns:
-        elements + 2 bodies, for `tree`. Its params "stiffness" and "damping" hold k and k damping of each spring.
+        elements + 2 bodies, for `tree`. Their params "stiffness" and "damping" hold k and k damping of each spring.
 
     Raises: TypeError, ValueError: an argument of a wrong kind or value.
 
@@ -61,7 +62,8 @@ def beam(
         R. Huston, Multi-body dynamics including the effects of flexibility and compliance, Comput. Struct. 14, 1981,
         443-451; E. Wittbrodt, I. Adamiec-Wojcik, S. Wojciech, Dynamics of Flexible Multibody Systems, 2006, Ch. 3.
 
-    Example: a bar of steel (1 m, 20 mm by 5 mm) sags by rhoA g L^4/(8 EI), here by 1 - 1/(2 elements^2) of it.
+    Example: a steel bar (1 m, 20 mm by 5 mm). It sags by rhoA g L^4/(8 EI), and the model by 1 - 1/(2 elements^2) of
+    this.
 
     >>> import hhtjax
     >>> from hhtjax import bodies
@@ -92,9 +94,9 @@ def beam(
 
 
 def _checked(name: str, length: Real, elements: int, EI: Any, rhoA: Real, GJ: Any, rhoI: Any, damping: Real):
-    """The length of an element, and the pairs of EI and rhoI; errors for what is none."""
+    """The length of an element, and the pairs of EI and rhoI; raises errors for wrong values."""
     if not isinstance(name, str) or not name:
-        raise TypeError(f"beam: `name` must be a name; received {name!r}.")
+        raise TypeError(f"beam: `name` must be a string; received {name!r}.")
     require_integer("beam", "elements", elements)
     for label, value in (("length", length), ("rhoA", rhoA), ("GJ", GJ)):
         if value is not None or label != "GJ":
@@ -102,7 +104,7 @@ def _checked(name: str, length: Real, elements: int, EI: Any, rhoA: Real, GJ: An
     require_number("beam", "damping", damping, lambda x: 0 <= x < np.inf, "be 0 or more")
     bending = _pair("EI", EI)
     if bending == (None, None) and GJ is None:
-        raise ValueError(f"beam: `EI` or `GJ` must say how it gives way; received {EI!r} and {GJ!r}.")
+        raise ValueError(f"beam: give `EI` or `GJ`, so that the beam is flexible; received {EI!r} and {GJ!r}.")
     for value in bending:
         if value is not None:
             require_number("beam", "EI", value, lambda x: 0 < x < np.inf, "be positive")
@@ -113,7 +115,7 @@ def _checked(name: str, length: Real, elements: int, EI: Any, rhoA: Real, GJ: An
 
 
 def _pair(name: str, value: Any) -> tuple:
-    """(about y, about z) of one number or two."""
+    """(about y, about z), from one number or two."""
     if not isinstance(value, (tuple, list, np.ndarray)):
         return value, value
     if len(value) != 2:

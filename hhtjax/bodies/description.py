@@ -1,8 +1,8 @@
-"""What a mechanism is made of, as its user writes it down: bodies, joints, motors, loops, markers. SI units.
+"""The parts of a mechanism as the user describes it: bodies, joints, motors, loops, markers. SI units.
 
-Frames: a body hangs on its parent at `position` and `rotation`, both seen from the parent's frame. Its joints come
-next, in their order, each fixed in the frame that those before have moved; behind the last is the frame of the body,
-in which its centre of mass, its inertia and what hangs on it are given.
+Frames: a body is attached to its parent at `position` and `rotation`, both in the frame of the parent. Then follow its
+joints in their order; each is fixed in the frame that the joints before it have moved. The frame after the last joint
+is the frame of the body. Its centre of mass, its inertia, and the bodies attached to it are given in this frame.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ UNIT = 1e-6  # by which an axis, or a rotation, may miss length 1
 
 
 def vector(caller: str, name: str, value: Any, shape: tuple = (3,)) -> tuple:
-    """Finite numbers of a shape, as a tuple of Python floats."""
+    """Finite numbers of the given shape, as a tuple of Python floats."""
     try:
         x = np.asarray(value, float)
     except (TypeError, ValueError):
@@ -32,16 +32,16 @@ def vector(caller: str, name: str, value: Any, shape: tuple = (3,)) -> tuple:
 
 
 def _direction(caller: str, name: str, value: Any) -> tuple:
-    """A vector that is not zero, made a unit vector."""
+    """A vector that is not zero, normalised."""
     x = np.array(vector(caller, name, value))
     size = np.linalg.norm(x)
     if size == 0:
-        raise ValueError(f"{caller}: `{name}` must be a direction; received {value!r}.")
+        raise ValueError(f"{caller}: `{name}` must be a direction, not zero; received {value!r}.")
     return tuple((x if abs(size - 1) < 1e-15 else x / size).tolist())
 
 
 def _rotation(caller: str, name: str, value: Any) -> tuple:
-    """A rotation as 9 numbers: from a matrix (3, 3), or a quaternion (4,) of any length, with its real part first."""
+    """A rotation as 9 numbers, from a matrix (3, 3) or a quaternion (4,) of any length with its real part first."""
     if np.shape(value) not in ((4,), (3, 3)):
         raise ValueError(f"{caller}: `{name}` must be a matrix (3, 3) or a quaternion (4,); received {value!r}.")
     x = np.reshape(vector(caller, name, value, np.shape(value)), np.shape(value))
@@ -58,7 +58,7 @@ def _rotation(caller: str, name: str, value: Any) -> tuple:
 
 
 def of_quaternion(quaternion) -> np.ndarray:
-    """R (3, 3) of (w, x, y, z), whatever its length; NaN for zero."""
+    """R (3, 3) of a quaternion (w, x, y, z) of any length; NaN for zero."""
     w, x, y, z = np.asarray(quaternion, float) / np.linalg.norm(quaternion)
     return np.array(
         [
@@ -70,13 +70,13 @@ def of_quaternion(quaternion) -> np.ndarray:
 
 
 def tidy(x: np.ndarray) -> np.ndarray:
-    """The same with numbers that are zero but for rounding made zero, which costs a program nothing."""
+    """x with entries that are zero up to rounding set to zero, which makes the program cheaper."""
     return np.where(np.abs(x) < 1e-15, 0.0, x)
 
 
 def _name(caller: str, name: str, value: Any) -> str:
     if not isinstance(value, str) or not value:
-        raise TypeError(f"{caller}: `{name}` must be a name; received {value!r}.")
+        raise TypeError(f"{caller}: `{name}` must be a string; received {value!r}.")
     return value
 
 
@@ -90,19 +90,21 @@ class Joint:
     """A joint between a body and its parent.
 
     Args:
-        kind: "revolute" (rad) or "prismatic" (m) about or along `axis`; "planar", along two directions normal to `axis`
+        kind: "revolute" (rad) or "prismatic" (m) about or along `axis`; "planar": along two directions normal to `axis`
             (m) and about it (rad); "ball"; "free", for a body on the world.
-        axis: in the frame of the body; made a unit vector. The two directions of "planar" are the images of x and y
-            under the shortest turn from z to `axis`.
+        axis: in the frame of the body; it is normalised. The two directions of "planar" are the images of x and y under
+            the shortest rotation from z to `axis`.
         anchor: a point of the axis, or the centre of a ball, in the frame of the body, m.
-        name: of the joint; None for that of its body. Further joints of a body without a name are BODY_2, ..., and a
-            spring on the axis of the joint before it, as `flexible` makes one, is JOINT_spring.
-        stiffness, rest: of a spring, N m/rad or N/m, and where it is relaxed. Balls and free joints are relaxed where
-            they are described; `rest` is 0 then. Of joints of several rates one number is of all.
-        damping: N m s/rad or N s/m. armature: inertia of a rotor, as the joint sees it, kg m^2 or kg.
+        name: of the joint; None for the name of its body. Further unnamed joints of a body are BODY_2, ..., and a
+            spring on the axis of the previous joint, as made by `flexible`, is JOINT_spring.
+        stiffness, rest: of a spring, N m/rad or N/m, and the coordinate at which it is relaxed. Balls and free joints
+            are relaxed in the described position; `rest` must then be 0. For joints with several rates, one number
+            applies to all.
+        damping: N m s/rad or N s/m. armature: inertia of a rotor, reflected to the joint, kg m^2 or kg.
         friction: limit of dry friction, N m or N, >= 0.
-        range: (lowest, highest), for one rate only; None without.
-        reference: the coordinate of the position that is described, for one rate only, rad or m; q0 starts there.
+        range: (lowest, highest), only for joints with one rate; None for no limits.
+        reference: the value of the coordinate in the described position, only for joints with one rate, rad or m; q0
+            starts there.
 
     Raises: TypeError, ValueError: an argument of a wrong kind or value.
     """
@@ -133,7 +135,7 @@ class Joint:
             _set(self, **{name: value})
         if self.kind == "free" and any(self.anchor):
             raise ValueError(
-                f"Joint: a free joint turns about the origin of its body; received `anchor` {self.anchor!r}."
+                f"Joint: a free joint turns about the origin of its body: leave out `anchor`; received {self.anchor!r}."
             )
         if self.range is not None:
             if self.kind not in SCALARS:
@@ -146,18 +148,19 @@ class Joint:
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body, and how it hangs on its parent.
+    """A rigid body, and how it is attached to its parent.
 
     Args:
-        name: its own; "world" is taken.
-        parent: name of the body it hangs on, which comes before it, or "world".
-        joints: a `Joint`, several, which act one after the other, or none for a body that is fixed to its parent.
-        mass: kg. com: centre of mass, (3,), m. inertia: about it, (3, 3), its diagonal (3,), or Ixx, Iyy, Izz, Ixy,
-            Ixz, Iyz (6,), kg m^2. All in the frame of the body.
-        position, rotation: of the frame of the body in that of its parent, where its joints are at zero: (3,) in m, and
-            a matrix (3, 3) or a quaternion (w, x, y, z), whose length does not matter.
+        name: its own name; "world" is reserved.
+        parent: name of the body to which it is attached, which must come before it, or "world".
+        joints: a `Joint`; or several, in their order from the parent; or none for a body that is fixed to its parent.
+        mass: kg. com: centre of mass, (3,), m. inertia: about the centre of mass, (3, 3), its diagonal (3,), or Ixx,
+            Iyy, Izz, Ixy, Ixz, Iyz (6,), kg m^2. All in the frame of the body.
+        position, rotation: of the frame of the body in the frame of its parent, when its joints are at zero: (3,) in m,
+            and a matrix (3, 3) or a quaternion (w, x, y, z) of any length.
 
-    Raises: TypeError, ValueError: an argument of a wrong kind or value; a mass or an inertia that no body has.
+    Raises: TypeError, ValueError: an argument of a wrong kind or value; a mass or an inertia that is physically
+    impossible.
     """
 
     name: str
@@ -171,13 +174,15 @@ class Body:
 
     def __post_init__(self):
         if _name("Body", "name", self.name) == WORLD:
-            raise ValueError('Body: `name` must not be "world", which carries all bodies.')
+            raise ValueError('Body: `name` must not be "world", which is the frame to which all bodies are attached.')
         _name("Body", "parent", self.parent)
         joints = (self.joints,) if isinstance(self.joints, Joint) else self.joints
         if not isinstance(joints, (list, tuple)) or not all(isinstance(joint, Joint) for joint in joints):
             raise TypeError(f"Body: `joints` must be a Joint or a sequence of them; received {self.joints!r}.")
         if any(joint.kind == "free" for joint in joints) and (self.parent != WORLD or len(joints) > 1):
-            raise ValueError(f"Body: a free joint is the only one of a body on the world; {self.name!r} has others.")
+            raise ValueError(
+                f"Body: a free joint must be the only joint of a body on the world; {self.name!r} has others."
+            )
         _set(self, joints=tuple(joints))
         mass = require_number("Body", "mass", self.mass, lambda m: 0 <= m < np.inf, "be 0 or more")
         _set(self, mass=float(mass), com=vector("Body", "com", self.com))
@@ -186,21 +191,21 @@ class Body:
         _set(self, inertia=_inertia(self.name, self.inertia, self.mass))
 
     def with_joints(self, joints) -> Body:
-        """The same with others."""
+        """The body with other joints."""
         return self._changed(joints=tuple(joints))
 
     def placed_at(self, position) -> Body:
-        """The same at another position."""
+        """The body at another position."""
         return self._changed(position=tuple(position))
 
     def _changed(self, **values) -> Body:
-        """The same with other fields."""
+        """The body with other fields."""
         R, inertia = (np.reshape(x, (3, 3)) for x in (self.rotation, self.inertia))
         return replace(self, **{"rotation": R, "inertia": inertia, **values})
 
 
 def _inertia(name: str, inertia: Any, mass: float) -> tuple:
-    """The tensor as 9 numbers, if a body may have it."""
+    """The tensor as 9 numbers; raises an error if no body can have it."""
     shape = np.shape(inertia)
     if shape not in ((3,), (6,), (3, 3)):
         raise ValueError(f"Body: `inertia` of {name!r} must have shape (3, 3), (3,) or (6,); received {inertia!r}.")
@@ -215,36 +220,36 @@ def _inertia(name: str, inertia: Any, mass: float) -> tuple:
     moments = np.linalg.eigvalsh(x)
     if moments[0] < -1e-12 * moments[2] or moments[2] > moments[0] + moments[1] + 1e-6 * moments[2]:
         raise ValueError(
-            f"Body: `inertia` of {name!r} must be that of a body, its principal moments >= 0 and none larger than the "
+            f"Body: `inertia` of {name!r} must be possible: principal moments >= 0, none larger than the "
             f"sum of the others; received {moments.tolist()}."
         )
     if moments[2] > 0 and mass == 0:
-        raise ValueError(f"Body: {name!r} has inertia and no mass: give `mass`, or take `armature` of a joint.")
+        raise ValueError(f"Body: {name!r} has inertia but no mass: give `mass`, or use the `armature` of a joint.")
     return tuple(x.ravel().tolist())
 
 
 @dataclass(frozen=True)
 class Motor:
-    """What drives a joint: the torque gear * F, at the motor's angle s = gear * q, by the input u (params["ctrl"]).
+    """A motor at a joint: the torque gear * F, at the motor's angle s = gear * q, for the input u (params["ctrl"]).
 
         "torque"      F = gain u - kp s - kv sdot + offset
         "position"    F = kp (u - s) - kv sdot + offset
         "velocity"    F = kv (u - sdot) - kp s + offset
 
-    With an activation z, an internal state of the system, z stands in the place of u:
+    With an activation z, an internal state of the system, z replaces u:
 
         "integrator"  zdot = u
         "filter"      zdot = (u - z)/timeconst
 
     Args:
         joint: name of a revolute or prismatic joint. kind: one of the three.
-        gear: transmission. gain, kp, kv: see the formulas. name: None for that of the joint.
+        gear: transmission ratio. gain, kp, kv: see the formulas. name: None for the name of the joint.
         offset: a constant force, added to F.
-        ctrlrange, forcerange: (lowest, highest) of u and of F, which are clipped; None without.
-        activation: "integrator" or "filter"; None without.
-        timeconst: of a filter, s, > 0.
-        actrange: (lowest, highest) of z, for a motor with an activation; None without. F reads z clipped to it, and
-            beyond its ends z is drawn back with a time constant of 1 ms, so that it does not wind up.
+        ctrlrange, forcerange: (lowest, highest) of u and of F, which are clipped; None for no limits.
+        activation: "integrator" or "filter"; None for none.
+        timeconst: time constant of a filter, s, > 0.
+        actrange: (lowest, highest) of z, for a motor with an activation; None for no limits. F uses z clipped to this
+            range. Outside the range z is drawn back with a time constant of 1 ms, so that it does not wind up.
 
     Raises: TypeError, ValueError: an argument of a wrong kind or value.
 
@@ -291,12 +296,12 @@ class Motor:
                 _set(self, **{name: (low, high)})
 
     def _check_activation(self):
-        """An error for another one, and for what belongs to none."""
+        """Raises an error for an unknown activation, and for options that the activation does not have."""
         if self.activation not in (None, "integrator", "filter"):
             raise ValueError(f"Motor: `activation` must be integrator, filter or None; received {self.activation!r}.")
         if (self.activation == "filter") != (self.timeconst is not None):
             raise ValueError(
-                f'Motor: `timeconst` belongs to a motor with activation="filter", which needs one; received '
+                f'Motor: `timeconst` belongs to a motor with activation="filter", which needs it; received '
                 f"{self.timeconst!r} with the activation {self.activation!r}."
             )
         if self.timeconst is not None:
@@ -308,7 +313,7 @@ class Motor:
 
 @dataclass(frozen=True)
 class Connect:
-    """A point of one body held to a point of another, as by a ball joint: three constraints.
+    """Keeps a point of one body at a point of another, like a ball joint: three constraints.
 
     Args:
         first, second: names of bodies, or "world". anchor1, anchor2: the points, in their frames, m.
@@ -330,11 +335,11 @@ class Connect:
 
 @dataclass(frozen=True)
 class Weld(Connect):
-    """A frame of one body held to a frame of another, place and orientation: six constraints.
+    """Keeps a frame of one body at a frame of another, in position and orientation: six constraints.
 
     Args:
-        first, second: names of bodies, or "world". anchor1, anchor2: the points that meet, in their frames, m.
-        rotation: of the second body seen from the first, a matrix (3, 3) or a quaternion (w, x, y, z).
+        first, second: names of bodies, or "world". anchor1, anchor2: the points that coincide, in their frames, m.
+        rotation: of the second body in the frame of the first, a matrix (3, 3) or a quaternion (w, x, y, z).
 
     Raises: TypeError, ValueError: an argument of a wrong kind or value.
     """
@@ -348,10 +353,10 @@ class Weld(Connect):
 
 @dataclass(frozen=True)
 class Couple:
-    """A joint that follows another, as by gears or a linkage: q1 - r1 = c0 + c1 (q2 - r2) + c2 (q2 - r2)^2 + ...
+    """Couples a joint to another, as by gears or a linkage: q1 - r1 = c0 + c1 (q2 - r2) + c2 (q2 - r2)^2 + ...
 
     Args:
-        first, second: names of revolute or prismatic joints; second None holds the first at r1 + c0.
+        first, second: names of revolute or prismatic joints; if second is None, the first is held at r1 + c0.
         coefficients: c0, c1, ... origins: (r1, r2).
 
     Raises: TypeError, ValueError: an argument of a wrong kind or value.
@@ -372,10 +377,11 @@ class Couple:
 
 @dataclass(frozen=True)
 class Marker:
-    """A named frame on a body, such as that of a tool: its place and orientation in the frame of the body.
+    """A named frame on a body, such as that of a tool.
 
     Args:
-        name: among `frames`. body: name of a body, or "world". position: (3,), m. rotation: as in `Body`.
+        name: its name in the results of `frames`. body: name of a body, or "world". position: (3,), in the frame of the
+            body, m. rotation: as in `Body`.
 
     Raises: TypeError, ValueError: an argument of a wrong kind or value.
     """
@@ -393,17 +399,17 @@ class Marker:
 
 
 def flexible(joint: Joint, stiffness: float, damping: float = 0.0) -> tuple[Joint, Joint]:
-    """A joint with a flexible gear: that of the motor, with the armature, and behind it a spring to the link.
+    """A joint with a flexible gear: the joint of the motor, with the armature, followed by a spring to the link.
 
     Args:
-        joint: of the motor; its name, armature, friction and damping stay on the motor's side.
+        joint: that of the motor; its name, armature, friction and damping stay on the motor's side of the spring.
         stiffness: N m/rad (N/m). damping: N m s/rad (N s/m), across the spring.
 
     Returns:
         Two joints, for `Body(joints=)`; the second, whose coordinate is the deflection, is named JOINT_spring.
 
-    Raises: TypeError, ValueError: an argument of a wrong kind or value; a joint without armature, whose motor would
-        have no inertia, or of more than one rate.
+    Raises: TypeError, ValueError: an argument of a wrong kind or value; a joint without armature (the motor would have
+    no inertia), or with more than one rate.
 
     >>> [x.stiffness for x in flexible(Joint("revolute", armature=0.5), 1e4)]
     [0.0, 10000.0]
@@ -415,13 +421,13 @@ def flexible(joint: Joint, stiffness: float, damping: float = 0.0) -> tuple[Join
 
 
 def denavit_hartenberg(rows: Any, *, modified: bool = False, **of_links: Any) -> list[Body]:
-    """Bodies of a serial arm by its Denavit-Hartenberg table: theta about z, d along z, a along x, alpha about x.
+    """Bodies of a serial arm from its Denavit-Hartenberg table: theta about z, d along z, a along x, alpha about x.
 
     Args:
-        rows: (N, 4): a (m), alpha (rad), d (m), theta0 (rad) of each joint, revolute, q added to theta0.
+        rows: (N, 4): a (m), alpha (rad), d (m), theta0 (rad) of each joint; all are revolute, with q added to theta0.
         modified: the convention of Craig, where a and alpha come before theta and d.
-        of_links: fields of `Body` and `Joint`, one entry for each link: mass, com, inertia, damping, armature, ... in
-            the frames of the table, each of which is fixed to its link and is the frame of its body.
+        of_links: fields of `Body` and `Joint`, each with one entry per link: mass, com, inertia, damping, armature, ...
+            They are given in the frames of the table; each frame is fixed to its link and is the frame of its body.
 
     Returns:
         Bodies link1, link2, ..., with joints joint1, joint2, ..., for `tree`.
@@ -439,9 +445,11 @@ def denavit_hartenberg(rows: Any, *, modified: bool = False, **of_links: Any) ->
     own, known = {f.name for f in fields(Body)}, {f.name for f in fields(Joint)}
     for name, values in of_links.items():
         if name not in (own | known) - {"name", "parent", "joints", "position", "rotation", "kind", "axis", "anchor"}:
-            raise TypeError(f"{caller}: `{name}` is no field of a link or its joint.")
+            raise TypeError(f"{caller}: `{name}` is not a field of a link or its joint.")
         if len(values) != len(rows):
-            raise ValueError(f"{caller}: `{name}` must have {len(rows)} entries, one a joint; received {len(values)}.")
+            raise ValueError(
+                f"{caller}: `{name}` must have {len(rows)} entries, one per joint; received {len(values)}."
+            )
     bodies = []
     for i, (a, alpha, d, theta) in enumerate(rows):
         turn, link = _screw(2, theta, d), _screw(0, alpha, a)
@@ -459,7 +467,7 @@ def denavit_hartenberg(rows: Any, *, modified: bool = False, **of_links: Any) ->
 
 
 def _screw(axis: int, angle: float, distance: float) -> np.ndarray:
-    """The homogeneous matrix (4, 4) of a turn about an axis, and a way along it."""
+    """The homogeneous matrix (4, 4) of a rotation about an axis and a translation along it."""
     T, (i, j) = np.eye(4), [(1, 2), (2, 0), (0, 1)][axis]
     c, s = np.cos(angle), np.sin(angle)
     T[[i, i, j, j], [i, j, i, j]] = c, -s, s, c

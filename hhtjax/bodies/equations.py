@@ -59,7 +59,7 @@ class Frame(NamedTuple):
 
 
 def position(tree: Tree, q: PyTree) -> Position:
-    """A tree's coordinates by kind."""
+    """The coordinates of a tree, by kind."""
     if not tree.balls:
         dtype = q.dtype
         return Position(q, jnp.zeros((0, 3, 3), dtype), jnp.zeros((0, 3), dtype))
@@ -80,7 +80,7 @@ def rates(tree: Tree, v: PyTree) -> Array:
 
 
 def as_rates(tree: Tree, x: Array) -> PyTree:
-    """A vector (nv,) as v is structured."""
+    """A vector (nv,) as a pytree structured like v."""
     if not tree.balls:
         return x
     n, f = tree.balls - tree.frees, tree.frees
@@ -106,16 +106,16 @@ def inertia_of(model: Model, params: PyTree) -> Inertia:
 
 
 def second_moment(inertia: Array) -> Array:
-    """Sigma = tr(I)/2 1 - I, of tensors of inertia I (..., 3, 3).
+    """Sigma = tr(I)/2 1 - I, for tensors of inertia I (..., 3, 3).
 
-    Of their symmetric parts: so the derivatives in I_ij and I_ji are the same, and a fit keeps I symmetric.
+    It uses the symmetric part of I, so the derivatives in I_ij and I_ji are equal, and a fit keeps I symmetric.
     """
     inertia = (inertia + jnp.swapaxes(inertia, -1, -2)) / 2
     return trace(inertia)[..., None] / 2 * np.broadcast_to(np.eye(3, dtype=inertia.dtype), inertia.shape) - inertia
 
 
 def of_links(model: Model, bodies: Inertia, params: PyTree) -> Inertia:
-    """The moments of bodies about their frames, as those of the links that carry them: linear in them."""
+    """The moments of the links about their frames, which are linear in those of the bodies they carry."""
     m, h, Sigma = bodies
     dtype = h.dtype
     R, x = (np.stack(both).astype(dtype) for both in zip(*((b.R, b.point) for b in model.bodies), strict=True))
@@ -140,14 +140,14 @@ def _numbers_of_bodies(model: Model):
 
 
 def offsets_of(model: Model, params: PyTree):
-    """Places of the nodes, (K, 3), where positions are free; else None."""
+    """Positions of the nodes, (K, 3), if positions are free; else None."""
     if model.offsets is None:
         return None
     return _affine(model.offsets[0], params["position"])
 
 
 def places_of(model: Model, params: PyTree):
-    """Origins of bodies and markers in their nodes, where positions are free; else None."""
+    """Origins of bodies and markers in their nodes, if positions are free; else None."""
     return None if model.offsets is None else _affine(model.offsets[1], params["position"])
 
 
@@ -161,7 +161,7 @@ def _affine(known: tuple, x: Array) -> Array:
 
 
 def frames_of(model: Model, q: PyTree, params: PyTree) -> list[Frame]:
-    """Of all bodies and markers, in the world."""
+    """The frames of all bodies and markers, in the world."""
     p = position(model.tree, q)
     placed, dtype = place(model.tree, p, offsets_of(model, params)), jax.tree.leaves(q)[0].dtype
     points = places_of(model, params)
@@ -199,7 +199,7 @@ class Dynamics:
 
 @dataclass(frozen=True)
 class ActivatedDynamics:
-    """r(q, v, w, z, t, params), structured like v, where motors have an activation z."""
+    """r(q, v, w, z, t, params), structured like v, if motors have an activation z."""
 
     model: Model
     is_affine = True
@@ -209,7 +209,7 @@ class ActivatedDynamics:
 
 
 def residual(model: Model, q: PyTree, v: PyTree, w: PyTree, z: Array | None, t: Real, params: PyTree) -> PyTree:
-    """What `Dynamics` gives."""
+    """The residual r of `Dynamics` and `ActivatedDynamics`."""
     tree = model.tree
     require_params(model, params)
     require_position(tree, q)
@@ -255,7 +255,7 @@ class Mass:
 
 @dataclass(frozen=True)
 class Friction:
-    """The limits of dry friction: structured like v where all rates rub, else (k,), of those that do."""
+    """The limits of dry friction: structured like v if all rates have friction, else (k,), for those that do."""
 
     model: Model
 
@@ -265,13 +265,13 @@ class Friction:
 
 
 def all_rub(model: Model) -> bool:
-    """Whether every rate does, in its order."""
+    """Whether every rate has friction, in the order of the rates."""
     return list(model.rubbing) == list(range(model.tree.rates))
 
 
 @dataclass(frozen=True)
 class Sliding:
-    """The rates that rub, (k,)."""
+    """The rates with friction, (k,)."""
 
     model: Model
 
@@ -280,7 +280,7 @@ class Sliding:
 
 
 def applied(model: Model, q: PyTree, p: Position, v: Array, z: Array | None, t: Real, params: PyTree) -> Array:
-    """Generalised forces of springs, dampers, motors, stops and what acts from outside: (nv,)."""
+    """Generalised forces of springs, dampers, motors, stops and external loads: (nv,)."""
     tree, n = model.tree, model.tree.rates - model.tree.scalars
     force = -params["damping"] * v
     x, rate = p.x, v[n:]
@@ -302,7 +302,7 @@ def applied(model: Model, q: PyTree, p: Position, v: Array, z: Array | None, t: 
 
 
 def at_time(x: PyTree, t: Real) -> PyTree:
-    """An input that is a function of the time, or constant."""
+    """The value of an input that is a function of time, or constant."""
     return x(t) if callable(x) else x
 
 
@@ -332,7 +332,7 @@ def driven(model: Model, x: Array, rate: Array, z: Array | None, t: Real, params
 
 
 def _clipped(x: Array, ranges: list) -> Array:
-    """Between the ends of what has a range."""
+    """x, clipped to the ranges that exist."""
     if not any(ranges):
         return x
     low, high = np.array([r or (-np.inf, np.inf) for r in ranges], x.dtype).T
@@ -340,13 +340,13 @@ def _clipped(x: Array, ranges: list) -> Array:
 
 
 def stopped(stop: Stop, x: Array, rate: Array, k: Real, d: Real) -> Array:
-    """The push of a stop, k p (1 + d pdot) by the penetration p, which it never pulls (Hunt, Crossley 1975)."""
+    """The force of a stop, k p (1 + d pdot) with the penetration p; it never pulls (Hunt, Crossley 1975)."""
     p = jnp.maximum(stop.side * (x[stop.slot] - stop.at), 0)
     return -stop.side * k * p * jnp.maximum(1 + d * stop.side * rate[stop.slot], 0)
 
 
 def sprung(model: Model, spring, k: Real, p: Position, force: Array) -> Array:
-    """A spring of a ball, or of a free joint, against the turn and the way from its rest."""
+    """Adds the spring of a ball or a free joint, against its rotation and translation from rest."""
     R = np.reshape(spring.R, (3, 3)).astype(force.dtype)
     turn = rotation.log(product(R.T, p.R[spring.ball]))
     first = 3 * spring.ball
@@ -358,7 +358,7 @@ def sprung(model: Model, spring, k: Real, p: Position, force: Array) -> Array:
 
 
 def wrenches(model: Model, q: PyTree, t: Real, params: PyTree) -> Array:
-    """The generalised force of moments and forces on bodies: {name: (6,), or a function of t}, world axes."""
+    """The generalised force of moments and forces on bodies: {name: (6,), or a function of t}, in world axes."""
     p = position(model.tree, q)
     placed, points = place(model.tree, p, offsets_of(model, params)), places_of(model, params)
     force = jnp.zeros(model.tree.rates, placed.S.dtype)
@@ -397,13 +397,13 @@ class Loops:
         return Phi if self.model.rows is None else Phi[np.asarray(self.model.rows)]
 
     def turns(self, q: PyTree, params: PyTree) -> Array:
-        """Of each weld the trace of the rotation by which it is open: 3 where it is closed, -1 half a turn off."""
+        """For each weld, the trace of the rotation that is left to close it: 3 if it is closed, -1 half a turn away."""
         frames = frames_of(self.model, q, params)
         return jnp.stack([jnp.trace(_turn(row, frames)) for row in self.model.loops if row.kind == "weld"])
 
 
 def _gap(row: Row, frames: list[Frame], x: Array) -> Array:
-    """What a loop is open by."""
+    """The closing error of a loop."""
     if row.kind == "couple":
         (r1, r2), coefficients = row.constants
         y = 0.0 * x[row.first] if row.second is None else x[row.second] - r2
@@ -418,7 +418,7 @@ def _gap(row: Row, frames: list[Frame], x: Array) -> Array:
 
 
 def _turn(row: Row, frames: list[Frame]) -> Array:
-    """The rotation by which a weld is open, (3, 3)."""
+    """The rotation that is left to close a weld, (3, 3)."""
     first, second = (frames[i].R for i in (row.first, row.second))
     between = np.reshape(row.constants[2], (3, 3)).astype(first.dtype)
     return product(jnp.swapaxes(product(first, between), 0, 1), second)
@@ -430,7 +430,7 @@ def _turn(row: Row, frames: list[Frame]) -> Array:
 
 @dataclass(frozen=True)
 class Reaches:
-    """What falls to zero where a joint reaches an end of its range."""
+    """The guard that falls to zero when a joint reaches an end of its range."""
 
     model: Model
     stop: Stop

@@ -1,4 +1,4 @@
-"""Functions of a mechanism, for use without a run: what joints must exert, M, frames, forces, the regressor."""
+"""Functions of a mechanism, for use without a run: joint torques, M, frames, forces, the regressor."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ UPPER = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)  # entries of a tensor, a
 
 
 def _known(caller: str, robot: Mechanism, params: PyTree, q: PyTree, **rates_given: PyTree):
-    """The model and the params, after a look at all arguments."""
+    """The model and the params, after checking all arguments."""
     if not isinstance(robot, Mechanism):
         raise TypeError(f"{caller}: `robot` must be a Mechanism, by `tree` or `load`; received {type(robot).__name__}.")
     params = robot.params if params is None else params
@@ -40,11 +40,12 @@ def _known(caller: str, robot: Mechanism, params: PyTree, q: PyTree, **rates_giv
 
 
 def inverse_dynamics(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: PyTree = None) -> PyTree:
-    """What the joints must exert for the accelerations w: M(q) w + bias(q, v), with armature, gravity and nothing else.
+    """The joint torques needed for the accelerations w: M(q) w + bias(q, v), with armature and gravity, no other
+    forces.
 
-    Args: robot: a `Mechanism`. q, v, w: as in its system. params: None for its own.
+    Args: robot: a `Mechanism`. q, v, w: as in its system. params: None for `robot.params`.
     Returns: structured like v, N m and N.
-    Raises: KeyError: params without an entry. TypeError, ValueError: no mechanism; an array of another shape.
+    Raises: KeyError: params without an entry. TypeError, ValueError: not a mechanism; an array of another shape.
 
     >>> from hhtjax.bodies import Body, Joint, inverse_dynamics, tree
     >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], inertia=[0, 0.25, 0.25])])
@@ -68,9 +69,9 @@ def inverse_dynamics(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: 
 def mass_matrix(robot: Mechanism, q: PyTree, params: PyTree = None) -> Array:
     """M(q), (nv, nv), with the armature; rows in the order of `jax.flatten_util.ravel_pytree(v)`.
 
-    Args: robot: a `Mechanism`. q: as in its system. params: None for its own.
+    Args: robot: a `Mechanism`. q: as in its system. params: None for `robot.params`.
     Returns: (nv, nv).
-    Raises: KeyError: params without an entry. TypeError, ValueError: no mechanism; an array of another shape.
+    Raises: KeyError: params without an entry. TypeError, ValueError: not a mechanism; an array of another shape.
 
     >>> from hhtjax.bodies import Body, Joint, mass_matrix, tree
     >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], inertia=[0, 0.25, 0.25])])
@@ -84,9 +85,9 @@ def mass_matrix(robot: Mechanism, q: PyTree, params: PyTree = None) -> Array:
 def frames(robot: Mechanism, q: PyTree, params: PyTree = None) -> dict[str, Frame]:
     """The frame of each body and marker in the world: `Mechanism.frames`.
 
-    Args: robot: a `Mechanism`. q: as in its system. params: None for its own.
+    Args: robot: a `Mechanism`. q: as in its system. params: None for `robot.params`.
     Returns: a dict, {name: Frame(R, x)}.
-    Raises: KeyError: params without an entry. TypeError, ValueError: no mechanism; an array of another shape.
+    Raises: KeyError: params without an entry. TypeError, ValueError: not a mechanism; an array of another shape.
 
     >>> from hhtjax.bodies import Body, Joint, frames, tree
     >>> rod = Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], position=[0, 0, 2])
@@ -100,12 +101,13 @@ def frames(robot: Mechanism, q: PyTree, params: PyTree = None) -> dict[str, Fram
 def forces(
     robot: Mechanism, q: PyTree, v: PyTree, t: Real = 0.0, params: PyTree = None, z: Array | None = None
 ) -> PyTree:
-    """Generalised forces of springs, dampers, motors, stops and what acts from outside, without gravity and friction.
+    """Generalised forces of springs, dampers, motors, stops and external loads, without gravity and friction.
 
-    Args: robot: a `Mechanism`. q, v: as in its system. t: s. params: None for its own. z: activations, None for z0.
+    Args: robot: a `Mechanism`. q, v: as in its system. t: s. params: None for `robot.params`. z: activations, None for
+    z0.
     Returns: structured like v.
-    Raises: KeyError: params without an entry. TypeError, ValueError: no mechanism; an array of another shape; a wrench
-        on what is no body.
+    Raises: KeyError: params without an entry. TypeError, ValueError: not a mechanism; an array of another shape; a
+    wrench on an unknown body.
 
     >>> from hhtjax.bodies import Body, Joint, forces, tree
     >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0], damping=0.2), mass=3.0, com=[0.5, 0, 0])])
@@ -120,15 +122,17 @@ def forces(
 
 
 def regressor(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: PyTree = None) -> Array:
-    """Y (nv, 10 nb) with inverse_dynamics - armature w = Y theta, linear in theta (10 nb,), ten numbers a body
+    """Y (nv, 10 nb) with inverse_dynamics - armature w = Y theta, linear in theta (10 nb,). theta has ten numbers per
+    body,
 
         m, m c (3), and Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the origin of the frame of the body
 
-    Atkeson, An, Hollerbach, Int. J. Robot. Res. 5(3), 1986. `inertial_parameters` gives theta.
+    (Atkeson, An, Hollerbach, Int. J. Robot. Res. 5(3), 1986). `inertial_parameters` returns theta.
 
-    Args: robot: a `Mechanism`. q, v, w: as in its system. params: for gravity and free positions, None for its own.
+    Args: robot: a `Mechanism`. q, v, w: as in its system. params: for gravity and free positions, None for
+    `robot.params`.
     Returns: (nv, 10 nb), bodies in the order of `Mechanism.bodies`.
-    Raises: KeyError: params without an entry. TypeError, ValueError: no mechanism; an array of another shape.
+    Raises: KeyError: params without an entry. TypeError, ValueError: not a mechanism; an array of another shape.
 
     >>> from hhtjax.bodies import Body, Joint, inertial_parameters, regressor, tree
     >>> rod = tree([Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0], inertia=[0, 0.25, 0.25])])
@@ -152,7 +156,7 @@ def inertial_parameters(params: PyTree) -> Array:
 
     Args: params: those of a `Mechanism`.
     Returns: (10 nb,).
-    Raises: KeyError: params without an entry. TypeError, ValueError: no mechanism; an array of another shape.
+    Raises: KeyError: params without an entry. TypeError, ValueError: not a mechanism; an array of another shape.
 
     >>> import jax.numpy as jnp
     >>> params = {"mass": jnp.array([2.0]), "com": jnp.array([[0.1, 0, 0]]), "inertia": jnp.eye(3)[None]}
@@ -168,7 +172,7 @@ def inertial_parameters(params: PyTree) -> Array:
 
 
 def _moments(theta: Array) -> Inertia:
-    """Mass, first and second moments of bodies about their frames, from theta."""
+    """Mass, first and second moments of bodies about the origins of their frames, from theta."""
     m, h, upper = jnp.split(theta.reshape(-1, 10), [1, 4], axis=-1)
     places = np.zeros((6, 3, 3), theta.dtype)
     for k, (i, j) in enumerate(UPPER):

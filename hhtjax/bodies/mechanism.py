@@ -47,31 +47,30 @@ SINGULAR = 1e-12  # eigenvalue of the mass matrix, its diagonal scaled to 1, tha
 
 @dataclass(frozen=True, eq=False)
 class Mechanism:
-    """A mechanism, and what a run needs besides a stepper and a step size; made by `tree` and `load`.
+    """A mechanism: its system, parameters and start; made by `tree` and `load`.
 
     Attributes:
         system: a `System` in minimal coordinates.
-        params: dict of arrays in SI units. One entry a body in `bodies`: mass (nb,), com (nb, 3), inertia (nb, 3, 3),
-            about the centre of mass in the frame of the body; one a rate: damping, armature (nv,); one a hinge
-            or slide: stiffness, springref (ns,); gravity (3,).
-            Where there are motors: gear, gain, kp, kv, offset, ctrl (na,), the last of which may be a function of t;
-            and timeconst (na,) where some are filters. Where there is dry friction: frictionloss (k,), of the rates in
-            `rubbing`. Where asked for: position (number of all bodies, 3), of those in `bodies`, in their order, and
-            behind them of those without a mass that moves, in the order of the description; spring_stiffness,
-            stop_stiffness, stop_damping, restitution. May be added: "torque", a generalised force structured like v,
-            and "wrench", {body: (moment, force) (6,)} in world axes, at the origin of the body or marker; constants, or
-            functions of t.
-        q0, v0: the position that is described, moved onto the loops where they were open, and rest. q is (ns,) where
-            there are hinges and slides only, else a dict: "ball" (., 3, 3), "free" {"R": (., 3, 3), "x": (., 3)}, and
-            "joint" (ns,); v is structured like q, with material angular velocities (., 3) in the place of rotations.
-        z0: activations of motors (nz,), 0 or the end of their range that is nearest, for `simulate(z0=)`; None where
-            there are none.
-        events: of the ends of ranges, for `simulate(events=)`; None but with limits="event".
+        params: dict of arrays in SI units. For each body in `bodies`: mass (nb,), com (nb, 3), inertia (nb, 3, 3),
+            about the centre of mass in the frame of the body. For each rate: damping, armature (nv,). For each hinge or
+            slide: stiffness, springref (ns,). gravity (3,). With motors: gear, gain, kp, kv, offset, ctrl (na,), where
+            ctrl may be a function of t; and timeconst (na,) if some are filters. With dry friction: frictionloss (k,),
+            for the rates in `rubbing`. If asked for: position (number of all bodies, 3), first of the bodies in
+            `bodies`, in their order, then of the bodies without a mass that moves, in the order of the description;
+            spring_stiffness, stop_stiffness, stop_damping, restitution. You may add "torque", a generalised force
+            structured like v, and "wrench", {body: (moment, force) (6,)} in world axes, at the origin of the body or
+            marker. Both may be constants or functions of t.
+        q0, v0: the described position, moved to close the loops if they were open, and zero velocity. q is (ns,) if
+            there are only hinges and slides, else a dict: "ball" (., 3, 3), "free" {"R": (., 3, 3), "x": (., 3)}, and
+            "joint" (ns,). v is structured like q, with material angular velocities (., 3) instead of rotations.
+        z0: activations of motors (nz,), each 0 or the nearest end of its range, for `simulate(z0=)`; None if there are
+            none.
+        events: events at the ends of ranges, for `simulate(events=)`; None unless limits="event".
         joints, bodies, motors: names, in the order of coordinates and params.
-        activations: names of the motors that have one, in the order of z.
+        activations: names of the motors that have an activation, in the order of z.
         markers: names of all frames: the world, bodies, markers.
-        rubbing: numbers of the rates with dry friction.
-        unsupported: what of a file is left out, as `load` was told.
+        rubbing: indices of the rates with dry friction.
+        unsupported: the features of a file that `load` was told to ignore.
     """
 
     system: System
@@ -96,11 +95,11 @@ class Mechanism:
         return f"Mechanism({len(self.bodies)} bodies, {tree.rates} rates{loops}, {len(self.motors)} motors)"
 
     def index(self, joint: str) -> int | tuple[int, ...]:
-        """Where the rates of a joint are in the vector of rates, and in damping and armature: a number, or numbers.
+        """Index of the rates of a joint in the vector of rates, and in damping and armature: a number, or several.
 
-        Where all joints are hinges and slides, it is the place in q too.
+        If all joints are hinges and slides, it is the index in q too.
 
-        Raises: KeyError: no joint of that name.
+        Raises: KeyError: there is no joint of that name.
         """
         if joint not in self.rates_of:
             raise KeyError(f"index: no joint is named {joint!r}; there are {', '.join(self.joints)}.")
@@ -108,24 +107,25 @@ class Mechanism:
         return found[0] if len(found) == 1 else found
 
     def body_index(self, body: str) -> int:
-        """The place of a body in mass, com and inertia.
+        """Index of a body in mass, com and inertia.
 
-        Raises: KeyError: no body with a mass of that name.
+        Raises: KeyError: there is no body with a mass of that name.
         """
         if body not in self.bodies:
             raise KeyError(f"body_index: no body with a mass is named {body!r}; there are {', '.join(self.bodies)}.")
         return self.bodies.index(body)
 
     def frames(self, q: PyTree, params: PyTree = None) -> dict[str, Frame]:
-        """The frame of each body and marker in the world, {name: Frame(R, x)}; params: None for its own."""
+        """The frame of each body and marker in the world, {name: Frame(R, x)}; params: None for `self.params`."""
         params = self.params if params is None else params
         return dict(zip(self.markers, frames_of(self.model, q, params), strict=True))
 
     def bars(self, params: PyTree = None) -> Bars:
-        """What to draw: a function of q that gives polylines, for `hhtjax.plot.animation`; params: None for its own.
+        """For drawing: a function of q that returns polylines, for `hhtjax.plot.animation`; params: None for
+        `self.params`.
 
-        Each body is a line from its origin to those of the bodies and markers on it, or, with none, to twice its centre
-        of mass, the other end of a uniform rod.
+        Each body is a line from its origin to the origins of the bodies and markers on it. If there are none, the line
+        ends at twice its centre of mass, the other end of a uniform rod.
         """
         return Bars(self, self.params if params is None else params)
 
@@ -154,7 +154,7 @@ class Bars:
 
 @partial(jax.jit, static_argnums=0)
 def _placed(model: Model, q: PyTree, params: dict) -> list[Frame]:
-    """`frames_of`, compiled once for a mechanism."""
+    """`frames_of`, compiled once per mechanism."""
     return frames_of(model, q, {name: params[name] for name in ("position",) if name in params})
 
 
@@ -169,28 +169,28 @@ def tree(
     limits: str | None = None,
     free: Sequence[str] = (),
 ) -> Mechanism:
-    """A mechanism of bodies, each on its parent, in minimal coordinates.
+    """A mechanism of bodies, each attached to its parent, in minimal coordinates.
 
     Args:
-        bodies: each a `Body`, behind its parent. Those without a mass are frames only.
-        motors: each a `Motor`. loops: `Connect`, `Weld` and `Couple`, constraints of the `System`. Rows that say what
-            others say already, as the third of a pin joint in a plane does, are found here and left out.
-        markers: each a `Marker`, a further frame.
-        gravity: (3,), m/s^2; the default is standard gravity, 9.80665 downwards. (A file that `load` reads has 9.81.)
-        friction: "dry", the set-valued friction of the joints (`System(friction=)`), or "ignore".
-        limits: of ranges, None where there are none: "ignore"; "stop", stiff springs that damp, with stop_stiffness and
-            stop_damping among params; or "event", impacts (`Mechanism.events`).
-        free: ("position",) for the positions of bodies among params; they are part of the program otherwise, which is
-            faster, as it knows their zeros.
+        bodies: each a `Body`, after its parent. Bodies without a mass are frames only.
+        motors: each a `Motor`. loops: `Connect`, `Weld` and `Couple`, constraints of the `System`. Redundant rows, such
+            as the third row of a pin joint in a plane, are detected here and removed.
+        markers: each a `Marker`, an additional frame.
+        gravity: (3,), m/s^2; default: standard gravity, 9.80665 downwards. (A file read by `load` has 9.81.)
+        friction: "dry": the set-valued friction of the joints (`System(friction=)`); or "ignore".
+        limits: what happens at the ends of a `range`; None if no joint has one. "ignore": nothing; "stop": stiff
+            springs with damping, with stop_stiffness and stop_damping in params; "event": impacts (`Mechanism.events`).
+        free: ("position",) puts the positions of bodies into params. Otherwise they are part of the program, which is
+            faster because it knows their zeros.
 
     Returns:
         A `Mechanism`.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind or value; names that are not known, or taken twice; loops
-            that cannot be closed; without loops, joints that can move without moving a mass.
+        TypeError, ValueError: an argument of a wrong kind or value; names that are unknown, or used twice; loops that
+            cannot be closed; without loops, joints that can move without moving a mass.
 
-    Example: a crane of a trolley (2 kg) and a rod (1 kg, 1 m).
+    Example: a crane with a trolley (2 kg) and a rod (1 kg, 1 m).
 
     >>> import numpy as np, hhtjax
     >>> from hhtjax.bodies import Body, Joint, tree
@@ -207,13 +207,13 @@ def tree(
 
 
 def assembled(*parts: Any) -> Mechanism:
-    """The mechanism of `_assembled`: of numbers that are known, also where a function is being traced."""
+    """The mechanism of `_assembled`, from concrete numbers, also while a caller is being traced."""
     with jax.ensure_compile_time_eval() if is_tracing() else nullcontext():
         return _assembled(*parts)
 
 
 def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits, free, unsupported=()) -> Mechanism:
-    """The mechanism; `caller` is who is asked for it."""
+    """The mechanism; `caller` is the public function, for errors."""
     bodies = _all_of(caller, "bodies", bodies, Body)
     motors, markers = _all_of(caller, "motors", motors, Motor), _all_of(caller, "markers", markers, Marker)
     loops = _all_of(caller, "loops", loops, (Connect, Weld, Couple))
@@ -227,7 +227,7 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
     massive = [body for body in bodies if body.mass > 0 and parts.node_of[body.name] >= 0]
     massive.sort(key=lambda body: parts.node_of[body.name])
     if not massive:
-        raise ValueError(f"{caller}: no body of `bodies` that moves has a mass.")
+        raise ValueError(f"{caller}: at least one of the moving `bodies` must have a mass; none has.")
     links = sorted({parts.node_of[body.name] for body in massive})
     own = Tree(tuple(parts.nodes), tuple(links))
     places = _places(caller, parts, bodies, markers)
@@ -238,7 +238,7 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
     springs = _springs(parts)
     stops = _stops(parts)
     if stops and limits is None:
-        raise ValueError(f'{caller}: joints have a `range`: say what they do, limits="stop", "event" or "ignore".')
+        raise ValueError(f'{caller}: joints have a `range`: give limits="stop", "event" or "ignore"; received None.')
     stops = () if limits == "ignore" else stops
     model = Model(
         own,
@@ -273,7 +273,8 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
         _require_inertia(caller, model, parts, q0, params)
     if free and model.rows is not None:
         raise NotImplementedError(
-            f'{caller}: free=("position",) is not for loops with rows that say nothing new here: elsewhere they may.'
+            f'{caller}: free=("position",) is not supported for loops with redundant rows, because other positions may '
+            "make these rows independent."
         )
     ends = tuple(Event(Reaches(model, stop), impact("restitution")) for stop in stops) if limits == "event" else ()
     names = tuple(motor.name or motor.joint for motor in motors)
@@ -286,7 +287,7 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
 
 
 def _system(model: Model) -> System:
-    """What has no loop has no constraint, and what does not rub no friction."""
+    """The system; without loops it has no constraint, and without dry friction no friction."""
     more: dict = {"constraint": Loops(model)} if model.loops else {}
     if model.rubbing:
         more["friction"] = Friction(model)
@@ -298,7 +299,7 @@ def _system(model: Model) -> System:
 
 
 def _activations(model: Model) -> Array | None:
-    """z0: 0, or the nearest end of their range."""
+    """z0: 0, or the nearest end of the range."""
     ranges = [model.drives[i].actrange or (-np.inf, np.inf) for i in model.activated]
     return _array([min(max(0.0, low), high) for low, high in ranges]) if ranges else None
 
@@ -316,7 +317,7 @@ def _all_of(caller: str, name: str, values: Any, kind: Any) -> list:
 
 
 def _places(caller: str, parts: Structure, bodies: list[Body], markers: list[Marker]) -> list[Place]:
-    """Frames of bodies and markers in their nodes."""
+    """Frames of bodies and markers, relative to their nodes."""
     found = [Place(WORLD, -1, tuple(np.eye(3).ravel().tolist()), (0.0, 0.0, 0.0))]
     for body in bodies:
         R, x = parts.frame_of[body.name]
@@ -333,11 +334,11 @@ def _places(caller: str, parts: Structure, bodies: list[Body], markers: list[Mar
 
 def _known(caller: str, name: str, value: str, known):
     if value not in known:
-        raise ValueError(f"{caller}: `{name}` names {value!r}; there are {', '.join(known)}.")
+        raise ValueError(f"{caller}: `{name}` names {value!r}, which is unknown; there are {', '.join(known)}.")
 
 
 def _roots(nodes) -> tuple:
-    """Of each node, the slot of the translation that its tree begins with, or -1."""
+    """For each node, the slot of the translation at the root of its tree, or -1."""
     found: list[int] = []
     for node in nodes:
         found.append(node.slot if node.kind == "translation" else found[node.parent] if node.parent >= 0 else -1)
@@ -361,7 +362,7 @@ def _stops(parts: Structure) -> tuple:
 
 
 def _springs(parts: Structure) -> dict[Spring, float]:
-    """Those of balls and free joints, and their stiffness."""
+    """The springs of balls and free joints, and their stiffness."""
     found = {}
     for joint, body, (ball, *ways) in parts.joints.values():
         if joint.kind in ("ball", "free") and joint.stiffness:
@@ -371,7 +372,7 @@ def _springs(parts: Structure) -> dict[Spring, float]:
 
 
 def _row(caller: str, parts: Structure, names: list, loop) -> Row:
-    """A loop by numbers."""
+    """A loop with names replaced by indices."""
     if isinstance(loop, Couple):
         for name in (loop.first, loop.second):
             if name is not None:
@@ -387,7 +388,7 @@ def _row(caller: str, parts: Structure, names: list, loop) -> Row:
 
 
 def _params(caller: str, model: Model, parts: Structure, bodies, motors, gravity, rubbing: tuple) -> dict:
-    """The description as arrays."""
+    """The params of a mechanism, from its description."""
     by_name = {body.name: body for body in bodies}
     own = [by_name[place.name] for place in model.bodies]
     tree = model.tree
@@ -418,7 +419,7 @@ def _params(caller: str, model: Model, parts: Structure, bodies, motors, gravity
 
 
 def _at_rest(model: Model, parts: Structure, bodies) -> PyTree:
-    """The position that is described."""
+    """The described position."""
     tree = model.tree
     joint = np.zeros(tree.scalars)
     for name, slot in parts.slots.items():
@@ -438,7 +439,7 @@ def _at_rest(model: Model, parts: Structure, bodies) -> PyTree:
 
 
 def _require_inertia(caller: str, model: Model, parts: Structure, q0: PyTree, params: dict):
-    """An error with the names of joints that can move without moving a mass, at the start and elsewhere."""
+    """Raises an error that names joints that can move without moving a mass, at the start and elsewhere."""
     rng = np.random.default_rng(0)
     start = jax.tree.map(np.asarray, q0)
     elsewhere = jax.tree.map(lambda x: _turned(x, rng) if x.ndim == 3 else x + rng.normal(size=x.shape), start)
@@ -449,12 +450,13 @@ def _require_inertia(caller: str, model: Model, parts: Structure, q0: PyTree, pa
     if names:
         raise ValueError(
             f"{caller}: the joint{'s' * (len(names) > 1)} {', '.join(names)} of `bodies` can move without moving a "
-            "mass, and the mass matrix is singular: give what is carried a mass and an inertia, or a joint `armature`."
+            "mass, so the mass matrix is singular: give the attached bodies mass and inertia, or the joint an "
+            "`armature`."
         )
 
 
 def _massless(M: np.ndarray) -> np.ndarray:
-    """Which rates are part of a motion that no mass takes part in: (nv,)."""
+    """Which rates take part in a motion that moves no mass: (nv,)."""
     scale = np.sqrt(np.diagonal(M))
     if not np.all(scale > 0):
         return scale == 0
@@ -463,12 +465,13 @@ def _massless(M: np.ndarray) -> np.ndarray:
 
 
 def _turned(R: np.ndarray, rng) -> np.ndarray:
-    """Other rotations (n, 3, 3)."""
+    """Random other rotations (n, 3, 3)."""
     return R @ np.reshape([of_quaternion(x) for x in rng.normal(size=(len(R), 4))], R.shape)
 
 
 def _affine_maps(caller: str, bodies: list[Body], markers: list[Marker], ordered: list[Body]) -> tuple:
-    """Places of nodes, and of frames in them, as affine functions of the positions of all bodies, as ordered."""
+    """Positions of nodes, and of frames in them, as affine functions of the positions of all bodies, in the given
+    order."""
     numbers = [ordered.index(body) for body in bodies]
 
     def at(positions: np.ndarray):
@@ -497,7 +500,7 @@ def _rows(model: Model) -> int:
 
 
 def _closed(caller: str, model: Model, q0: PyTree, v0: PyTree, params: dict):
-    """The model with those rows of its loops that are independent near the start, and a position on the loops."""
+    """The model with only the independent rows of its loops near the start, and a position that closes the loops."""
     blocks, (q, unravel) = kinematics.layout(q0, v0), ravel_pytree(q0)
     loops = Loops(model)
 
@@ -532,7 +535,7 @@ def _closed(caller: str, model: Model, q0: PyTree, v0: PyTree, params: dict):
     size = np.linalg.norm(rows, axis=1)
     able = np.flatnonzero(size > INDEPENDENT * size.max(initial=1e-300))
     if not able.size:
-        raise ValueError(f"{caller}: `loops` hold nothing that moves.")
+        raise ValueError(f"{caller}: `loops` constrain nothing that moves.")
     linalg: Any = import_module("scipy.linalg")  # when it is asked for: `import hhtjax` does without
     R, order = linalg.qr((rows[able] / size[able, None]).T, mode="r", pivoting=True)
     rank = int(np.sum(np.abs(np.diag(R)) > INDEPENDENT))
@@ -541,7 +544,7 @@ def _closed(caller: str, model: Model, q0: PyTree, v0: PyTree, params: dict):
 
 
 def _onto_loops(caller: str, q: Array, linearized, move, turned_over):
-    """The position nearest to q on the loops, and B there, by Gauss-Newton."""
+    """The position nearest to q that closes the loops, and B there, by Gauss-Newton."""
     for _ in range(50):
         Phi, B = map(np.asarray, linearized(q))
         if np.max(np.abs(Phi)) <= 1e-12:
@@ -549,11 +552,11 @@ def _onto_loops(caller: str, q: Array, linearized, move, turned_over):
         q = move(q, jnp.asarray(-np.linalg.pinv(B, rcond=1e-9) @ Phi, q.dtype))
     if turned_over(q):
         raise ValueError(
-            f"{caller}: a weld of `loops` would close half a turn off: describe a position that is nearer."
+            f"{caller}: a weld of `loops` would close with an error of half a turn: describe a position that is nearer."
         )
     if not np.max(np.abs(Phi)) <= 1e-6:
         raise ValueError(
-            f"{caller}: the loops cannot be closed from the position that is described: {np.max(np.abs(Phi)):.3g} m or "
+            f"{caller}: the loops cannot be closed from the described position: {np.max(np.abs(Phi)):.3g} m or "
             "rad is left. Describe a position that is nearer."
         )
     return q, B

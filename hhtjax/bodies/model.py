@@ -1,7 +1,7 @@
-"""From the description of a mechanism to what its equations need: a tree of joints, and arrays of parameters.
+"""Converts the description of a mechanism to the data of its equations: a tree of joints, and arrays of parameters.
 
-What is part of the program, because it is known when that is written: which joint hangs on which, axes, places, which
-motor drives what. What is data, in params: masses, springs, gears, gravity.
+Part of the program, because it is known when the program is made: the tree of joints, axes, positions, and which motor
+drives which joint. Data, in params: masses, springs, gears, gravity.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from hhtjax.bodies.tree import Node, Tree, skew
 
 
 class Place(NamedTuple):
-    """A frame fixed to a node (-1: the world): rotation (9 numbers) and place (3) there. Of a body or a marker."""
+    """The frame of a body or a marker, fixed to a node (-1: the world): rotation (9 numbers) and position (3) in the
+    node."""
 
     name: str
     node: int
@@ -30,7 +31,7 @@ class Place(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """A motor: the slot of its joint, and what its formula has. Clipped are u, F and z, where a range is given."""
+    """A motor: the slot of its joint, and the data of its formula. u, F and z are clipped if they have a range."""
 
     slot: int
     kind: str
@@ -41,7 +42,7 @@ class Drive(NamedTuple):
 
 
 class Spring(NamedTuple):
-    """Of a ball, or of both halves of a free joint: slots, rates, and the orientation and place of rest."""
+    """A spring of a ball, or of both halves of a free joint: slots, rates, and the relaxed orientation and position."""
 
     ball: int
     translation: int | None
@@ -58,7 +59,7 @@ class Stop(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A loop: kind, and numbers of frames (or slots) and constants."""
+    """A loop: its kind, indices of frames (or slots), and constants."""
 
     kind: str
     first: Any
@@ -67,7 +68,7 @@ class Row(NamedTuple):
 
 
 class _Fields(NamedTuple):
-    """Of a `Model`."""
+    """The fields of a `Model`."""
 
     tree: Tree
     bodies: tuple[Place, ...]  # those that carry mass, as in params
@@ -84,24 +85,24 @@ class _Fields(NamedTuple):
 
 
 class Model(_Fields):
-    """All that is part of the program."""
+    """Everything about a mechanism that is part of the program."""
 
     def __hash__(self):
         return self._hash
 
     @cached_property
     def _hash(self) -> int:
-        """Found once: a run asks for it often, and it is as long as the model."""
+        """The hash, computed once: a run needs it often, and it takes time proportional to the size of the model."""
         return tuple.__hash__(self)
 
     @property
     def activated(self) -> tuple[int, ...]:
-        """Numbers of the motors with an internal state."""
+        """Indices of the motors with an internal state."""
         return tuple(i for i, drive in enumerate(self.drives) if drive.activation)
 
 
 class Made(NamedTuple):
-    """A joint of a description and what it became."""
+    """A joint of a description, and the nodes made from it."""
 
     joint: Joint
     body: Body
@@ -109,12 +110,12 @@ class Made(NamedTuple):
 
     @property
     def rates(self) -> tuple:
-        """Its numbers in the vector of rates."""
+        """Its indices in the vector of rates."""
         return tuple(i for node in self.nodes for i in node.rates)
 
 
 class Structure(NamedTuple):
-    """What is made of bodies: the model's tree, and how names and numbers belong together."""
+    """The tree made from bodies, and the maps between names and indices."""
 
     nodes: list[Node]
     node_of: dict[str, int]  # body -> node, -1
@@ -128,7 +129,7 @@ class Structure(NamedTuple):
 
 
 def structure(caller: str, bodies: list[Body]) -> Structure:
-    """The nodes of bodies, in their order; errors for names that are taken twice, or not known yet."""
+    """The nodes of bodies, in their order; raises errors for names that are used twice, or not known yet."""
     kinds = [joint.kind for body in bodies for joint in body.joints]
     plain_balls, frees = kinds.count("ball"), kinds.count("free")
     turning = 3 * (plain_balls + frees)  # rates of balls, those of free joints among them: they come first
@@ -151,7 +152,9 @@ def structure(caller: str, bodies: list[Body]) -> Structure:
         if body.name in node_of:
             raise ValueError(f"{caller}: two bodies are named {body.name!r}.")
         if body.parent not in node_of:
-            raise ValueError(f"{caller}: {body.name!r} hangs on {body.parent!r}, which is no body before it.")
+            raise ValueError(
+                f"{caller}: the parent of {body.name!r} must be a body before it; received {body.parent!r}."
+            )
         node, (R, x) = node_of[body.parent], frame_of[body.parent]
         E, x = R @ np.reshape(body.rotation, (3, 3)), x + R @ np.asarray(body.position)
         last = np.zeros(3)  # what of the body's frame the last anchor is
@@ -178,7 +181,7 @@ def structure(caller: str, bodies: list[Body]) -> Structure:
 
 
 def _unnamed(body: Body, number: int, before: list[str]) -> str:
-    """A name for a joint without one; before: those of the joints before it."""
+    """A name for an unnamed joint; before: the names of the joints before it."""
     if number == 0:
         return body.name
     joint, last = body.joints[number], body.joints[number - 1]
@@ -187,7 +190,7 @@ def _unnamed(body: Body, number: int, before: list[str]) -> str:
 
 
 def _simple(joint: Joint):
-    """The joints of one kind that it consists of."""
+    """The joints with one kind of coordinate that it consists of."""
     axis = np.asarray(joint.axis)
     if joint.kind == "planar":
         first, second = in_plane(axis)
@@ -205,7 +208,7 @@ def in_plane(axis: np.ndarray):
 
 
 def _before(kind: str, E, x, axis, reference: float):
-    """The frame of a joint whose coordinate is `reference` where it is drawn."""
+    """The frame of a joint whose coordinate is `reference` in the described position."""
     if kind == "slide":
         return E, x - reference * (E @ axis)
     K = skew(axis)
@@ -217,10 +220,10 @@ def _numbers(x) -> Any:
 
 
 def numpy_mass_matrix(model: Model, q: Any, params: dict) -> np.ndarray:
-    """M (nv, nv) by NumPy, which compiles nothing, for looking at once.
+    """M (nv, nv) by NumPy, which compiles nothing; for a single evaluation.
 
-    M = armature + sum over bodies of m u^T u + a^T I a, with the velocities that unit rates give, u of the centre and a
-    of the turning. q: as in the system, of NumPy arrays.
+    M = armature + sum over bodies of m u^T u + a^T I a, where u and a are the velocity of the centre of mass and the
+    angular velocity for unit rates. q: as in the system, of NumPy arrays.
     """
     own = model.tree
     if own.balls:

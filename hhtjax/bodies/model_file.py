@@ -1,7 +1,7 @@
-"""Mechanisms from MJCF and URDF files. The package mujoco reads them, and does nothing else (extra `models`).
+"""`load`: mechanisms from MJCF and URDF files. The package mujoco only reads them (extra `models`).
 
-What acts in a file and is not in the equations here is refused in one list, unless it is ignored by name: a model
-that is missing something is not run by accident. The docstring of `load` has the names.
+Features of a file that the equations here do not model raise one error that lists all of them, unless they are ignored
+by name. So an incomplete model is never run by accident. The docstring of `load` lists the names.
 """
 
 from __future__ import annotations
@@ -56,47 +56,48 @@ def load(
 
     Args:
         source: path of a file, or its text.
-        ignore: names of what acts in the file and is to be left out; the list is below.
-        base: of a URDF, which does not say it: "fixed" to the world, or "free". A root link named "world" is the world
-            itself: "free" lets the one link loose that is fixed to it.
-        joints: what the file does not say of its joints: fields of `Joint` by name, {"elbow": {"friction": 2.0}}; those
-            under "*" are of all hinges and slides.
-        more: further bodies (`Body`), behind those of the file, such as a payload on the frame of a tool.
-        motors, loops, markers: further ones.
-        gravity: (3,), m/s^2, in the place of that of the file; None for the latter, which is (0, 0, -9.81) where the
-            file says nothing, as in mujoco. (The default of `tree` is standard gravity, 9.80665.)
+        ignore: names of features of the file to be left out; the list is below.
+        base: how the root link of a URDF is attached, which the file does not say: "fixed" to the world, or "free". A
+            root link named "world" is the world itself; "free" then frees the one link that is fixed to it.
+        joints: fields of `Joint` that the file does not contain, by joint name, {"elbow": {"friction": 2.0}}. Fields
+            under "*" apply to all hinges and slides.
+        more: additional bodies (`Body`), after those of the file, such as a payload on the frame of a tool.
+        motors, loops, markers: additional ones.
+        gravity: (3,), m/s^2, instead of that of the file. None takes that of the file, which is (0, 0, -9.81) if the
+            file does not give it, as in mujoco. (The default of `tree` is standard gravity, 9.80665.)
         friction, free: as in `tree`.
         limits: "ignore", "stop" or "event", as in `tree`; None if there are none. "ignore" is the same as
-            ignore=("limits",), and the only one for a file with a ball that has a range: a cone is neither stop nor
-            event here.
+            ignore=("limits",). It is the only choice for a file with a ball joint that has a range: such a cone can be
+            neither a stop nor an event here.
 
     Returns:
-        A `Mechanism`, with the names of the file, its positions (`qpos`) as coordinates, and q0 = qpos0.
-        Joints and motors without a name in the file bear that of their body, BODY_2 and so on, or "actuator" and a
-        number, made unique. The `mimic` of a URDF and equalities of joints are a `Couple`; a weld whose torquescale is
-        0 is a `Connect`. `unsupported` lists what was ignored. Motors with an activation (integrator, filter,
-        filterexact) have one here. Their flag `actearly` is about the steps of mujoco, and makes no difference here.
+        A `Mechanism` with the names of the file, its positions (`qpos`) as coordinates, and q0 = qpos0. Unnamed joints
+        and motors are named after their body, BODY_2 and so on, or "actuator" with a number, made unique. A `mimic` of
+        a URDF and an equality of joints become a `Couple`; a weld with torquescale 0 becomes a `Connect`. `unsupported`
+        lists what was ignored. Motors with an activation (integrator, filter, filterexact) keep it. Their flag
+        `actearly` concerns the steps of mujoco and has no effect here.
 
     What can be ignored:
-        "contact": bodies that can touch; they pass through each other then.
-        "limits": ranges of joints; joints turn without end then.
+        "contact": bodies that can touch; ignored, they pass through each other.
+        "limits": ranges of joints; ignored, joints move without limits.
         "tendon": tendons with a spring, a damper, friction, a range or an armature.
         "flex": deformable bodies. "plugin": plugins. "fluid": a medium with density or viscosity.
-        "mocap": bodies moved from outside; they stand still then. "gravcomp": compensation of gravity at bodies.
-        "actuator": motors of other kinds than `Motor`: muscles, those on sites, tendons, balls.
+        "mocap": bodies moved from outside; ignored, they stand still. "gravcomp": compensation of gravity at bodies.
+        "actuator": motors of kinds that `Motor` does not have: muscles, and those on sites, tendons, balls.
         "actuatorfrcrange": limits of the sum of the forces of all motors of a joint (`effort` in a URDF).
         "equality": constraints other than connect, weld and joint; and a mimic that mujoco does not read.
         "springyield": springs that yield. "polynomial": springs and dampers that are not linear.
-        "unphysical": links of a URDF with moments of inertia that no body has; all three are their mean then.
-        "massless": bodies with an inertia and no mass, which lose the inertia then; and joints of a URDF that move no
-            mass or turn no inertia, and have no armature, which are fixed then. `joints` can give them one, `more` a
+        "unphysical": links of a URDF with physically impossible moments of inertia; ignored, all three are replaced by
+            their mean.
+        "massless": bodies with an inertia but no mass, which then lose the inertia; and joints of a URDF that move no
+            mass or turn no inertia, and have no armature, which are then fixed. `joints` can add an armature, `more` a
             mass.
 
     Raises:
         ImportError: mujoco is not installed. FileNotFoundError: no such file.
-        NotImplementedError: something acts that is not modelled: the whole list.
-        TypeError, ValueError: an argument of a wrong kind or value; "limits" ignored and used at once; a file that
-            mujoco cannot read, in its words; joints that can move without moving a mass, as in `tree`.
+        NotImplementedError: the file has features that are not modelled; all are listed.
+        TypeError, ValueError: an argument of a wrong kind or value; "limits" both ignored and used; a file that mujoco
+            cannot read, with mujoco's message; joints that can move without moving a mass, as in `tree`.
 
     >>> from hhtjax import bodies
     >>> pendulum = bodies.load('''<mujoco><worldbody><body name="rod">
@@ -109,7 +110,7 @@ def load(
         require_one_of("load", "ignore", name, KNOWN)
     require_one_of("load", "base", base, ("fixed", "free"))
     if "limits" in ignore and limits in ("stop", "event"):
-        raise ValueError(f'load: `ignore` leaves out "limits", and `limits` is {limits!r}: take one of the two.')
+        raise ValueError(f'load: `ignore` contains "limits", but `limits` is {limits!r}: give one of them.')
     limits = "ignore" if "limits" in ignore else limits
     model, acting, given = _compiled(source, base)
     parts = Reader(model, given)
@@ -123,8 +124,8 @@ def load(
     if refused:
         words = "\n".join(f"    {name}: {what}" for name, what in refused)
         names = ", ".join(f'"{name}"' for name in dict(refused) if name != "limits" or limits is None)
-        way = f"Leave it out by name, ignore=({names},), or change" if names else "Change `limits`, or"
-        raise NotImplementedError(f"load: the file holds what acts and is not modelled:\n{words}\n{way} the file.")
+        way = f"Ignore them by name, ignore=({names},), or change" if names else "Change `limits`, or"
+        raise NotImplementedError(f"load: the file has features that are not modelled:\n{words}\n{way} the file.")
     unsupported = tuple(f"{name}: {what}" for name, what in acting)
     of_file = [body.with_joints(joint for joint in body.joints if joint.name not in idle) for body in of_file]
     ties = [loop for loop in parts.loops() if not (isinstance(loop, Couple) and {loop.first, loop.second} & {*idle})]
@@ -136,7 +137,7 @@ def load(
 
 
 def _moving_nothing(bodies: list[Body], more: list[Body]) -> list:
-    """Names of the joints without armature that move no mass, or turn no inertia, whatever the position."""
+    """Names of the joints without armature that move no mass, or turn no inertia, in any position."""
     frames, above = {WORLD: (np.eye(3), np.zeros(3))}, {}
     for body in [*bodies, *more]:
         if body.parent not in frames:
@@ -148,7 +149,7 @@ def _moving_nothing(bodies: list[Body], more: list[Body]) -> list:
     heavy = [body for body in [*bodies, *more] if body.mass > SMALLEST and body.name in above]
 
     def moves(body: Body, joint: Joint) -> bool:
-        """Whether there is anything that the joint accelerates."""
+        """Whether the joint accelerates any mass or inertia."""
         carried = [part for part in heavy if body.name in above[part.name]]
         further = any(movable & (above[part.name] - above[body.name]) for part in carried)
         if joint.kind != "revolute" or further:  # what is on its axis here may leave it
@@ -165,7 +166,7 @@ def _moving_nothing(bodies: list[Body], more: list[Body]) -> list:
 
 
 def _with_changes(bodies: list[Body], joints: dict) -> list[Body]:
-    """The bodies with further fields of their joints."""
+    """The bodies with additional fields of their joints."""
     names = [joint.name for body in bodies for joint in body.joints]
     for name, values in joints.items():
         require_one_of("load", "joints", name, ("*", *names))
@@ -180,13 +181,14 @@ def _with_changes(bodies: list[Body], joints: dict) -> list[Body]:
 
 
 def _compiled(source: Any, base: str):
-    """The model as mujoco compiles it, what acts and mujoco does not see then, and masses that are not the model's."""
+    """The model as compiled by mujoco, features that mujoco then does not show, and masses that were replaced for
+    compiling."""
     mujoco = package()
     text, folder = _text(source)
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise ValueError(f"load: `source` is no XML: {error}.") from None
+        raise ValueError(f"load: `source` is not valid XML: {error}.") from None
     if root.tag not in ("robot", "mujoco"):
         raise ValueError(f"load: `source` must be MJCF (mujoco) or URDF (robot); its root is {root.tag!r}.")
     acting, given = [], {}
@@ -214,7 +216,7 @@ def _compiled(source: Any, base: str):
 
 
 def _without_strange_masses(spec, acting: list) -> dict:
-    """Masses that mujoco does not compile replaced by 1; returns what they are: mass, com, and inertia, by body."""
+    """Replaces masses that mujoco does not compile by 1. Returns the true mass, com and inertia, by body."""
     given, unphysical, massless = {}, [], []
     for body in spec.bodies[1:]:
         x = body.fullinertia
@@ -247,20 +249,21 @@ def _without_strange_masses(spec, acting: list) -> dict:
 
 
 def _require_one_root(root):
-    """An error for a root link "world" that carries more than one fixed link: mujoco makes it the world itself."""
+    """Raises an error for a root link "world" that carries more than one fixed link; mujoco makes this link the
+    world."""
     if root.tag == "mujoco":
-        raise ValueError('load: `base` is for URDF; MJCF says itself what is free; received "free".')
+        raise ValueError('load: `base` is for URDF; an MJCF file itself says which bodies are free; received "free".')
     held = [joint for joint in root.iter("joint") if getattr(joint.find("parent"), "attrib", {}).get("link") == WORLD]
     if len(held) > 1 or any(joint.get("type") != "fixed" for joint in held):
         names = _some([f"{joint.get('name')} ({joint.get('type')})" for joint in held])
         raise ValueError(
-            f'load: `base` is "free", and the root link of the URDF is "world", which does not move: only one link '
-            f"that is fixed to it can be let loose; it carries the joints {names}. Rename the link."
+            f'load: `base` is "free", and the root link of the URDF is "world", which does not move. Only one link '
+            f"that is fixed to it can be freed; it carries the joints {names}. Rename the link."
         )
 
 
 def _text(source: Any):
-    """What a file holds, and whether it is one."""
+    """The text of the model, and whether it came from a file."""
     if isinstance(source, str) and source.lstrip().startswith("<"):
         return source, False
     if not isinstance(source, (str, os.PathLike)):
@@ -270,7 +273,8 @@ def _text(source: Any):
 
 
 def _simplified(root) -> list:
-    """A URDF without shapes, whose files mostly are not there, and all links kept. What acts and is seen here only."""
+    """Removes the shapes of a URDF, whose files are often missing, and keeps all links. Returns features that only this
+    function sees."""
     acting = []
     touching = [link.get("name") for link in root.iter("link") if link.find("collision") is not None]
     if touching:
@@ -291,12 +295,12 @@ def _simplified(root) -> list:
 
 
 def _some(names: list) -> str:
-    """At most five of them."""
+    """At most five of the names, in words."""
     return ", ".join(map(str, names[:5])) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def _acting(parts: Reader, limits: str | None, motors: bool) -> list:
-    """What acts in a compiled model and is not in the equations here: (name, words)."""
+    """The features of a compiled model that the equations here do not have: (name, words)."""
     mujoco, m = package(), parts.m
     found: list = []
 
@@ -361,7 +365,7 @@ def _acting(parts: Reader, limits: str | None, motors: bool) -> list:
 
 
 def _can_touch(m) -> bool:
-    """Whether two shapes of different bodies may collide, by their bits and by whose parent is whose."""
+    """Whether two shapes of different bodies may collide, by their contact bits and by the tree of bodies."""
     filtered = not is_off(m.opt.disableflags, "FILTERPARENT")
     excluded = [_pair(int(s) >> 16, int(s) & 0xFFFF) for s in m.exclude_signature]
     shapes = np.stack([m.geom_contype, m.geom_conaffinity, m.geom_bodyid], axis=1).astype(np.int64)
@@ -382,5 +386,5 @@ def _can_touch(m) -> bool:
 
 
 def _pair(a: Any, b: Any) -> Any:
-    """A number for two bodies, whichever comes first."""
+    """A key for two bodies in either order."""
     return np.minimum(a, b) * 65536 + np.maximum(a, b)

@@ -1,4 +1,4 @@
-"""The parts of a model that mujoco has compiled, as those of a description: bodies, joints, motors, loops, markers."""
+"""Converts a model that mujoco has compiled to a description: bodies, joints, motors, loops, markers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SHORTEST = 1e-15  # s, mujoco's mjMINVAL, below which no filter is
 
 
 def package() -> Any:
-    """The package, imported when a file is read."""
+    """The package mujoco, imported when a file is read."""
     try:
         return importlib.import_module("mujoco")
     except ImportError:
@@ -28,7 +28,7 @@ def is_off(flags: int, *names: str) -> bool:
 
 
 def num_actuators(m) -> int:
-    """How many actuators there are, by what every version of mujoco has."""
+    """The number of actuators, by an attribute that every version of mujoco has."""
     return len(m.actuator_trntype)
 
 
@@ -39,20 +39,20 @@ def is_on_joint(m, i: int) -> bool:
 
 
 def turns(m, i: int) -> bool:
-    """Whether it is on a hinge or a slide."""
+    """Whether an actuator is on a hinge or a slide."""
     kinds = package().mjtJoint
     one = int(kinds.mjJNT_HINGE), int(kinds.mjJNT_SLIDE)
     return is_on_joint(m, i) and int(m.jnt_type[m.actuator_trnid[i, 0]]) in one
 
 
 def gear_of(m, i: int) -> float:
-    """Of an actuator; one that has several outputs has as many rows of them."""
+    """The gear of an actuator; one with several outputs has several rows of gears."""
     rows = getattr(m, "actuator_outadr", None)
     return float(m.actuator_gear[i if rows is None else rows[i], 0])
 
 
 def strangeness(m, i: int) -> str | None:
-    """Why an actuator is none of `Motor`'s kinds; None for one that is, or that is switched off."""
+    """Why an actuator is not one of the kinds of `Motor`; None if it is, or if it is switched off."""
     mujoco = package()
     if m.opt.disableactuator & (1 << int(m.actuator_group[i])):
         return None
@@ -74,14 +74,14 @@ def strangeness(m, i: int) -> str | None:
 
 
 def activations() -> dict:
-    """Of the numbers that mujoco has for them, those that `Motor` has."""
+    """mujoco's numbers of the activations that `Motor` has, and their names."""
     kinds = package().mjtDyn
     known = kinds.mjDYN_NONE, kinds.mjDYN_INTEGRATOR, kinds.mjDYN_FILTER, kinds.mjDYN_FILTEREXACT
     return dict(zip(map(int, known), (None, "integrator", "filter", "filter"), strict=True))
 
 
 def unique_names(given: list[str], made: list[str], others: Sequence[str] = ()) -> list[str]:
-    """Names in the file, and where it has none, those that were made, with _2, _3, ... as far as they are taken."""
+    """The names in the file; missing names are replaced by those in `made`, with _2, _3, ... if these are taken."""
     taken, names = {*given, *others}, []
     for name, other in zip(given, made, strict=True):
         number, found = 1, name or other
@@ -94,7 +94,7 @@ def unique_names(given: list[str], made: list[str], others: Sequence[str] = ()) 
 
 
 class Reader:
-    """The parts of a compiled model as those of a description."""
+    """Converts the parts of a compiled model to those of a description."""
 
     def __init__(self, m, given: dict):
         mujoco = package()
@@ -113,7 +113,7 @@ class Reader:
         self.names = {"body": self.body_names, "joint": self.joint_names, "actuator": actuators, "tendon": tendons}
 
     def bodies(self) -> list[Body]:
-        """Of all but the world."""
+        """All bodies except the world."""
         m, found = self.m, []
         for i in range(1, m.nbody):
             first, count = m.body_jntadr[i], m.body_jntnum[i]
@@ -130,7 +130,7 @@ class Reader:
         return found
 
     def joint(self, j: int) -> Joint:
-        """With springs, dampers and friction as far as they are switched on."""
+        """A joint, with its springs, dampers and friction unless they are switched off."""
         m, kinds, off = self.m, self.mujoco.mjtJoint, self.m.opt.disableflags
         dof, q = m.jnt_dofadr[j], m.jnt_qposadr[j]
         kind = {
@@ -154,14 +154,14 @@ class Reader:
         )
 
     def rotor(self, j: int) -> float:
-        """The armature of the motors of a joint, as it sees it."""
+        """The armature of the motors of a joint, reflected to the joint."""
         m = self.m
         values = getattr(m, "actuator_armature", np.zeros(num_actuators(m)))
         here = [i for i in np.flatnonzero(values).tolist() if is_on_joint(m, i) and m.actuator_trnid[i, 0] == j]
         return float(sum(values[i] * gear_of(m, i) ** 2 for i in here))  # rotors turn, whether or not they are driven
 
     def actuators(self):
-        """Numbers of those that are modelled, and switched on."""
+        """The indices of the actuators that are modelled and switched on."""
         m = self.m
         if is_off(m.opt.disableflags, "ACTUATION"):
             return []
@@ -169,11 +169,11 @@ class Reader:
         return [i for i in on if strangeness(m, i) is None]
 
     def motors(self) -> list[Motor]:
-        """F = gain u + b0 + b1 s + b2 sdot, as the kind of motor that it is."""
+        """The motors, F = gain u + b0 + b1 s + b2 sdot, as the kind of `Motor` with this formula."""
         return [self.motor(i) for i in self.actuators()]
 
     def motor(self, i: int) -> Motor:
-        """A servo where its bias follows its gain."""
+        """One motor: a servo if its bias follows from its gain."""
         m = self.m
         gain = float(m.actuator_gainprm[i, 0])
         affine = m.actuator_biastype[i] == int(self.mujoco.mjtBias.mjBIAS_AFFINE)
@@ -196,7 +196,7 @@ class Reader:
         )  # fmt: skip
 
     def loops(self) -> list:
-        """Of the kinds connect, weld and joint that are switched on."""
+        """The equality constraints of the kinds connect, weld and joint that are switched on."""
         m, kinds = self.m, self.mujoco.mjtEq
         if is_off(m.opt.disableflags, "EQUALITY", "CONSTRAINT"):
             return []
@@ -206,7 +206,7 @@ class Reader:
         ]
 
     def ends(self, i: int) -> list:
-        """Body, place and orientation of both sides, where they are sites; else bodies alone."""
+        """Body, position and orientation of both sides if they are sites; otherwise only the bodies."""
         m = self.m
         both = []
         for k in (m.eq_obj1id[i], m.eq_obj2id[i]):
@@ -223,7 +223,7 @@ class Reader:
         return Connect(a, b, data[:3] if x is None else x, data[3:6] if y is None else y)
 
     def weld(self, i: int) -> Connect:
-        """Two frames; two points where torquescale is 0, which lets them turn."""
+        """A weld of two frames; a connection of two points if torquescale is 0, which leaves rotations free."""
         (a, x, R), (b, y, S) = self.ends(i)
         data = self.m.eq_data[i]
         if data[10] == 0:

@@ -1,10 +1,10 @@
-"""Inverse dynamics of a tree of bodies, and its slopes in closed form.
+"""Inverse dynamics of a tree of bodies, and its derivatives in closed form.
 
-    ID(q, v, w) = M(q) w + bias(q, v),    M w + bias = what joints must exert for accelerations w
+    ID(q, v, w) = M(q) w + bias(q, v),    the joint forces needed for the accelerations w
 
-All vectors are in world axes, and all moments about the root of each tree, so that what a joint carries is a sum. A
-joint has one row S = (a, u) for each of its rates: the angular velocity that a unit of it gives, and the velocity of
-the point at the origin. With y the origin of its frame, about which it turns,
+All vectors are in world axes, and all moments about the root of each tree, so that the load of a joint is a sum over
+bodies. A joint has one row S = (a, u) for each of its rates: a is the angular velocity for unit rate, and u the
+velocity of the point at the root. With y the origin of its frame, about which it turns,
 
     hinge (a, y x a)      slide (0, a)      ball (R e_i, y x R e_i), material      translation (0, e_i)
 
@@ -12,12 +12,12 @@ The sums over the joints at or above a body, and those strictly above a joint (i
 
     V = sum S v,    A = -g + sum (S w + V_p x S v)
 
-and a body of mass m, first moment h and second moment Sigma about the origin asks for
+and the force and moment needed by a body of mass m, first moment h and second moment Sigma about the root are
 
     lin = A_u + om x V_u,    D = hat(al) + om om^T - |om|^2 1
     f = m lin + D h,    N = lin h^T + D Sigma,    moment = (N32 - N23, N13 - N31, N21 - N12)
 
-With F the sum of (moment, f) over the bodies that a joint carries, ID_i = S_i . F_i. Slopes: `slopes`.
+With F the sum of (moment, f) over the bodies that a joint carries, ID_i = S_i . F_i. The derivatives are in `slopes`.
 
 References: R. Featherstone, Rigid Body Dynamics Algorithms, 2008, Ch. 5 and 6; J. Carpentier, N. Mansard, Analytical
 derivatives of rigid body dynamics algorithms, Robotics: Science and Systems, 2018; S. Singh, R. Russell, P. Wensing,
@@ -41,11 +41,11 @@ ELEMENTWISE = 16  # rates up to which products of rows are written out, which on
 
 
 class Position(NamedTuple):
-    """Where a tree is.
+    """The position of a tree.
 
     Attributes:
-        x: of hinges and slides, (ns,). R: of balls, (nr, 3, 3); those of free joints behind the others.
-        y: of free joints, (nf, 3), which nothing but places depends on.
+        x: of hinges and slides, (ns,). R: of balls, (nr, 3, 3), those of free joints last.
+        y: of free joints, (nf, 3); only the positions of frames depend on it.
     """
 
     x: Array
@@ -54,7 +54,7 @@ class Position(NamedTuple):
 
 
 class Inertia(NamedTuple):
-    """Of each link: mass (L,), first moment (L, 3) and second moment (L, 3, 3) about its frame, in its axes."""
+    """For each link: mass (L,), first moment (L, 3) and second moment (L, 3, 3) about its frame, in its axes."""
 
     m: Array
     h: Array
@@ -62,7 +62,7 @@ class Inertia(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """Frames of all nodes: R (K, 3, 3), y (K, 3), seen from the root of each tree; and the rows S (nv, 6)."""
+    """Frames of all nodes relative to the root of their tree: R (K, 3, 3), y (K, 3); and the rows S (nv, 6)."""
 
     R: list
     y: list
@@ -70,7 +70,7 @@ class Placed(NamedTuple):
 
 
 def place(tree: Tree, p: Position, offsets: Any = None) -> Placed:
-    """The frame of each node, from the root to the tips. offsets: (K, 3) in the place of the tree's own, or None."""
+    """The frame of each node, from the root to the tips. offsets: (K, 3), instead of those of the tree, or None."""
     dtype = p.x.dtype
     sines, cosines = jnp.sin(p.x), 1 - jnp.cos(p.x)
     R: list = []
@@ -109,7 +109,7 @@ def _rows(node, R: Array, y: Array, axis: np.ndarray):
 
 
 def in_world(tree: Tree, placed: Placed, inertia: Inertia) -> Inertia:
-    """The same about the roots, in world axes."""
+    """The inertias about the roots, in world axes."""
     R, y = (jnp.stack([x[k] for k in tree.links]) for x in (placed.R, placed.y))
     h = apply(R, inertia.h)
     whole = h + inertia.m[:, None] * y
@@ -118,7 +118,7 @@ def in_world(tree: Tree, placed: Placed, inertia: Inertia) -> Inertia:
 
 
 class Motion(NamedTuple):
-    """What both functions below need. above: V_p x S, (nv, 6). V, A: of links, (L, 6). rates: S w + V_p x S v."""
+    """Velocities and accelerations. above: V_p x S, (nv, 6). V, A: of links, (L, 6). rates: S w + V_p x S v."""
 
     above: Array
     V: Array
@@ -129,7 +129,7 @@ class Motion(NamedTuple):
 
 
 def motion(tree: Tree, S: Array, v: Array, w: Array, gravity: Array) -> Motion:
-    """Velocities and accelerations, those of the world against gravity among them."""
+    """Velocities and accelerations; the world has the acceleration -g."""
     along = S * v[:, None]
     Vp = total(tree.above, along)
     above = turned(Vp, S)
@@ -139,7 +139,7 @@ def motion(tree: Tree, S: Array, v: Array, w: Array, gravity: Array) -> Motion:
 
 
 def required(inertia: Inertia, V: Array, A: Array):
-    """(moment, force) that each link asks for: (L, 6)."""
+    """The (moment, force) that each link needs: (L, 6)."""
     lin, D = _accelerations(V, A)
     f = inertia.m[:, None] * lin + apply(D, inertia.h)
     N = outer(lin, inertia.h) + product(D, inertia.Sigma)
@@ -147,7 +147,7 @@ def required(inertia: Inertia, V: Array, A: Array):
 
 
 def _accelerations(V: Array, A: Array):
-    """The acceleration of the origin's point, and D, which gives that of others."""
+    """The acceleration of the point at the root, and D, which gives the acceleration of other points."""
     om, al = V[:, :3], A[:, :3]
     lin = A[:, 3:] + cross(om, V[:, 3:])
     eye = np.eye(3, dtype=V.dtype)[None]
@@ -158,7 +158,7 @@ def _accelerations(V: Array, A: Array):
 def plain_inverse_dynamics(
     tree: Tree, p: Position, v: Array, w: Array, inertia: Inertia, gravity: Array, offsets: Any = None
 ) -> Array:
-    """ID (nv,), for derivatives of all kinds by autodiff."""
+    """ID (nv,), which autodiff can differentiate in every way."""
     placed = place(tree, p, offsets)
     x = motion(tree, placed.S, v, w, gravity)
     F = total(tree.carried, required(in_world(tree, placed, inertia), x.V, x.A))
@@ -166,7 +166,7 @@ def plain_inverse_dynamics(
 
 
 class Slopes(NamedTuple):
-    """ID (nv,), and its slopes (nv, nv) in displacements, rates and accelerations; the last is M."""
+    """ID (nv,), and its derivatives (nv, nv) in displacements, rates and accelerations; the last is M."""
 
     value: Array
     q: Array
@@ -177,13 +177,14 @@ class Slopes(NamedTuple):
 def slopes(
     tree: Tree, p: Position, v: Array, w: Array, inertia: Inertia, gravity: Array, offsets: Any = None
 ) -> Slopes:
-    """The slopes in closed form. With C for what a joint carries, J its inertia, and p_j, c_j of a joint j
+    """The derivatives in closed form. With C for the bodies that a joint carries, J their inertia, and p_j, c_j of a
+    joint j
 
         K = V_u h^T + hat(om) Sigma,    f = m V_u + om x h,    2B X = (2 (tr K 1 - K) X_om, 2 X_om x f)
         p_j = V_p x S_j,    c^q_j = A_p x S_j + V_p x p_j,    c^v_j = 2 p_j + (S v of the joint) x S_j
 
     dID_i/dq_j = S_i . (J_i c^q_j + 2B_i p_j) for j at or above i, S_i . (J_j c^q_j + 2B_j p_j + S_j x* F_j) for i above
-    j; dID_i/dv_j the same with c^v_j, S_j in the place of c^q_j, p_j, and without F.
+    j. dID_i/dv_j is the same with c^v_j and S_j instead of c^q_j and p_j, and without F.
     """
     placed = place(tree, p, offsets)
     S = placed.S
@@ -210,7 +211,7 @@ def slopes(
 
 
 class Carried(NamedTuple):
-    """Sums over what each rate's joint carries."""
+    """Sums over the bodies that the joint of each rate carries."""
 
     F: Array
     m: Array
@@ -221,7 +222,7 @@ class Carried(NamedTuple):
 
     @classmethod
     def of(cls, tree: Tree, F: Array, inertia: Inertia, K: Array, f: Array) -> Carried:
-        """From those of the links."""
+        """The sums, from the values of the links."""
         L = len(tree.links)
         parts = [F, inertia.m[:, None], inertia.h, inertia.Sigma.reshape(L, 9), K.reshape(L, 9), f]
         whole = total(tree.carried, jnp.concatenate(parts, axis=-1))
@@ -265,7 +266,7 @@ def mass_matrix(tree: Tree, p: Position, inertia: Inertia, offsets: Any = None) 
 def inverse_dynamics(
     tree: Tree, p: Position, v: Array, w: Array, inertia: Inertia, gravity: Array, offsets: Any = None
 ) -> Array:
-    """ID (nv,), with the slopes in q, v and w in closed form; those in all else by autodiff."""
+    """ID (nv,), with closed-form derivatives in q, v and w; derivatives in everything else are by autodiff."""
     return plain_inverse_dynamics(tree, p, v, w, inertia, gravity, offsets)
 
 
@@ -290,14 +291,14 @@ def _(tree: Tree, primals: tuple, tangents: tuple):
 
 
 def displacement(tree: Tree, p: Position, dp: Position) -> Array:
-    """The change of a position as one of rates, (nv,)."""
+    """The change of a position, as a vector of rates (nv,)."""
     dx, dR = as_numbers(dp.x), as_numbers(dp.R)
     dpsi = axial(product(jnp.swapaxes(p.R, 1, 2), dR)) / 2
     return jnp.concatenate([dpsi.ravel(), jnp.zeros(3 * tree.frees, dx.dtype), dx]) if tree.balls else dx
 
 
 def is_zero(x) -> bool:
-    """Whether autodiff knows a tangent to be zero."""
+    """Whether a tangent is known to autodiff as zero."""
     return isinstance(x, SymbolicZero)
 
 
@@ -350,13 +351,13 @@ def trace(A: Array) -> Array:
 
 
 def turned(X: Array, Y: Array) -> Array:
-    """X x Y, of motions: the rate of a motion Y that is fixed to what moves with X."""
+    """X x Y, for motions: the rate of a motion Y that is fixed to a body moving with X."""
     om, u = X[:, :3], X[:, 3:]
     return jnp.concatenate([cross(om, Y[:, :3]), cross(u, Y[:, :3]) + cross(om, Y[:, 3:])], axis=-1)
 
 
 def wrenched(X: Array, F: Array) -> Array:
-    """X x* F: the rate of a (moment, force) that is fixed to what moves with X."""
+    """X x* F: the rate of a (moment, force) that is fixed to a body moving with X."""
     om, u = X[:, :3], X[:, 3:]
     return jnp.concatenate([cross(om, F[:, :3]) + cross(u, F[:, 3:]), cross(om, F[:, 3:])], axis=-1)
 

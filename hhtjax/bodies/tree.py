@@ -1,4 +1,4 @@
-"""A tree of joints as data that is part of a program: which joint hangs on which, where, and what it carries."""
+"""A tree of joints, as the part of a mechanism that belongs to the program: parents, positions, axes, links."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ Vector = tuple[float, float, float]
 
 
 class Node(NamedTuple):
-    """A joint of one kind, and the frame behind it, with the origin on its axis. In the frame before it
+    """A joint of one kind, and the frame after it, whose origin is on the axis. Relative to the frame before it, the
+    rotation and the origin of this frame are
 
         hinge: E exp(q hat(axis)), offset     slide: E, offset + q E axis     ball: E R, offset
 
-    are its rotation and its place; of a "translation", the first half of a free joint, E = 1 and offset = 0.
+    For a "translation", the first half of a free joint, E = 1 and offset = 0.
 
     Attributes:
-        parent: number of the node it hangs on, -1 for the world.
+        parent: number of the parent node, -1 for the world.
         kind: "hinge", "slide", "ball", or "translation", whose rates are along the axes of the world.
         rotation: E, 9 numbers. offset: (3,). axis: (3,), a unit vector in its own frame.
-        slot: number among the coordinates of its kind: hinges and slides together, balls, translations.
-        rates: its numbers in the vector of rates.
+        slot: index among the coordinates of its kind: hinges and slides together, balls, translations.
+        rates: its indices in the vector of rates.
     """
 
     parent: int
@@ -51,12 +52,13 @@ def skew(a) -> np.ndarray:
 
 
 class Tree:
-    """Joints, each behind the one it hangs on, and which of their frames carry mass. Hashable; equal ones are alike.
+    """Joints, each after its parent, and which of their frames carry mass. Hashable; trees with equal contents are
+    equal.
 
     Attributes:
-        nodes: each a `Node`, behind its parent. K is their number.
-        links: numbers of the nodes that carry mass, (L,).
-        scalars, balls, frees, rates: numbers of hinges and slides; of balls, those of free joints among them; of free
+        nodes: each a `Node`, after its parent. K is their number.
+        links: indices of the nodes that carry mass, (L,).
+        scalars, balls, frees, rates: the number of hinges and slides; of balls, including those of free joints; of free
             joints; of all rates, nv.
     """
 
@@ -89,7 +91,7 @@ class Tree:
 
     @cached_property
     def node_of_rate(self) -> np.ndarray:
-        """(nv,)."""
+        """The node of each rate, (nv,)."""
         found = np.zeros(self.rates, int)
         for k, node in enumerate(self.nodes):
             found[list(node.rates)] = k
@@ -97,7 +99,7 @@ class Tree:
 
     @cached_property
     def at_or_above(self) -> np.ndarray:
-        """Whether the joint of rate j is that of rate i, or one that carries it: (nv, nv)."""
+        """Whether the joint of rate j is the joint of rate i, or lies between it and the root: (nv, nv)."""
         return self._at[np.ix_(self.node_of_rate, self.node_of_rate)]
 
     @cached_property
@@ -107,7 +109,7 @@ class Tree:
 
     @cached_property
     def above(self) -> np.ndarray:
-        """Whether the joint of rate j carries that of rate i, and is another: (nv, nv)."""
+        """Whether the joint of rate j lies between the joint of rate i and the root: (nv, nv)."""
         return self.at_or_above & ~self.beside
 
     @cached_property

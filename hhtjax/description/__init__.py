@@ -22,12 +22,13 @@ PLAIN = frozenset([bool, int, float, complex, str, type(None)])
 
 
 def is_array(x):
-    """Arrays, NumPy scalars and tracers are data; Python numbers are part of the program."""
+    """Whether it is an array, a NumPy scalar or a tracer, all of which are data; Python numbers are part of the
+    program."""
     return type(x) not in PLAIN and isinstance(x, (jax.Array, np.ndarray, np.generic))  # which takes longer to say no
 
 
 def is_concrete(x):
-    """False for a tracer, whose value is not known while a function is being traced."""
+    """False for a tracer, whose value is unknown while a function is being traced."""
     return not isinstance(x, Tracer)
 
 
@@ -42,7 +43,8 @@ def is_tracing():
 
 
 def known_now(f, *args):
-    """f(*args) in arrays of NumPy, while something is traced, too; None where it has tracers, closed over or not."""
+    """f(*args) as arrays of NumPy, also while something is being traced; None if it contains tracers, in args or closed
+    over."""
     if not all_concrete(args):
         return None
     with jax.ensure_compile_time_eval() if is_tracing() else nullcontext():
@@ -51,13 +53,13 @@ def known_now(f, *args):
 
 
 def as_float(x):
-    """An array of floats: of numbers of other kinds in the default precision."""
+    """An array of floats; other numbers are converted to the default precision."""
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
 
 
 def is_real(x):
-    """A real number, or an array of them; no booleans, text, objects or complex numbers."""
+    """Whether it is a real number, or an array of them; booleans, text, objects and complex numbers are not."""
     if is_array(x):
         return jnp.issubdtype(x.dtype, jnp.floating) or jnp.issubdtype(x.dtype, jnp.integer)
     return isinstance(x, (int, float)) and not isinstance(x, bool)
@@ -65,7 +67,7 @@ def is_real(x):
 
 @jax.tree_util.register_pytree_node_class
 class Fixed:
-    """A function among data, as a pytree without leaves: part of the program."""
+    """A function inside data, as a pytree without leaves, which makes it part of the program."""
 
     def __init__(self, function):
         self.function = function
@@ -84,9 +86,10 @@ class Fixed:
 
 
 def freeze(tree):
-    """The pytree with its leaves that are functions hidden, so that only data are left; the same where there are none.
+    """The pytree with its leaves that are functions hidden, so that only data are left. Without functions it is
+    returned unchanged.
 
-    Modules of neural networks have such leaves: their activations. Not hidden are callable arrays and tracers.
+    Modules of neural networks have such leaves: their activations. Callable arrays and tracers are not hidden.
     """
     leaves, structure = jax.tree.flatten(tree)
     hidden = [callable(x) and not is_array(x) and is_concrete(x) for x in leaves]
@@ -96,7 +99,7 @@ def freeze(tree):
 
 
 def thaw(tree):
-    """What `freeze` was given; whatever holds nothing hidden is returned as it is."""
+    """The inverse of `freeze`. A pytree without hidden functions is returned unchanged."""
     leaves, structure = jax.tree.flatten(tree, is_leaf=_is_fixed)
     if not any(map(_is_fixed, leaves)):
         return tree
@@ -115,11 +118,11 @@ def _fingerprint(x):
 
 
 class Description:
-    """Base of systems and steppers, which say what to compute and hold no state.
+    """Base class of systems and steppers, which describe a computation and hold no state.
 
-    A subclass is a frozen dataclass with `eq=False`. Arrays among its fields (a constant mass
-    matrix, an `alpha` that is being differentiated) are leaves of the pytree; functions, as they are
-    `current`, Python numbers and strings are static. Two descriptions are equal, and hash alike, when all fields are.
+    A subclass is a frozen dataclass with `eq=False`. Arrays among its fields (a constant mass matrix, an `alpha` that
+    is being differentiated) are leaves of the pytree. Functions, in their `current` form, Python numbers and strings
+    are static. Two descriptions are equal, and have the same hash, if all their fields are equal.
     """
 
     def __init_subclass__(cls):

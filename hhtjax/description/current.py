@@ -1,4 +1,5 @@
-"""What stands for a function in the programs of JAX: itself, or, where it reads other data, another of its kind."""
+"""`current`: the form of a function in the programs of JAX: itself, or another object if the data that it reads have
+changed."""
 
 import functools
 import types
@@ -17,9 +18,10 @@ programs = weakref.WeakSet()  # jitted functions of the library: they keep what 
 
 
 def current(f) -> Any:
-    """f, as long as all that it reads from outside is what it was; else what does the same, but is not equal to f.
+    """f, as long as everything that it reads from outside is unchanged; otherwise a function that does the same, but is
+    not equal to f.
 
-    To be called where a function becomes part of what JAX keeps a program by.
+    Call it where a function becomes part of the key under which JAX keeps a program.
 
     >>> gain = [1.0]
     >>> force = lambda q: gain[0] * q
@@ -41,7 +43,7 @@ _methods: dict[tuple, tuple] = {}  # by those of an object and its function
 
 
 def _first(f):
-    """The same of a function that has not been met."""
+    """`current` for a function that has not been seen before."""
     if isinstance(f, types.MethodType):
         return _known_method(f).current(f)
     if isinstance(f, (types.FunctionType, partial)):
@@ -74,7 +76,7 @@ def _enter(f, known, origin=None):
 
 
 def _known_method(f):
-    """By its object and its function: a method is another object each time."""
+    """A key from its object and its function, because every access to a method makes a new object."""
     key = id(f.__self__), id(f.__func__)
     if (entry := _methods.get(key)) is not None:
         return entry[1]
@@ -85,7 +87,7 @@ def _known_method(f):
 
 
 def _with_current_fields(f):
-    """A dataclass of functions, such as a force by a Lagrangian, with what stands for each."""
+    """A dataclass of functions, such as a force from a Lagrangian, with the current form of each."""
     changed = {}
     for field in fields(f):
         x = getattr(f, field.name)
@@ -100,7 +102,7 @@ def _with_current_fields(f):
 
 
 def _with_current_call(f):
-    """The same, of which equal ones are known by the function of their class."""
+    """As `_parts`; equal dataclasses are identified by the function of their class."""
     call = type(f).__call__
     if not is_users(type(f)) or not isinstance(call, types.FunctionType) or (now := current(call)) is call:
         return f
@@ -117,7 +119,7 @@ class _Called:
 
 
 class Known:
-    """What stands for a function in each state of what it reads."""
+    """The forms of a function, one for each state of what it reads."""
 
     def __init__(self):
         self.unread = set()
@@ -127,7 +129,7 @@ class Known:
         self.are_data = True  # arrays, as far as is known
 
     def current(self, f):
-        """What stands for f now."""
+        """The form of f for the present state."""
         if self.look is None or self.look.holds(f) is None:
             return self._found(f)
         form = self.states[-1][1]
@@ -158,14 +160,14 @@ class Known:
         return form
 
     def ignore(self, changed, form, f):
-        """What the function changes itself is not compared any more. form: what stands for f, and has been called."""
+        """Stops comparing what the function changes itself. form: the form of f that has been called."""
         self.unread |= set(map(Same, changed))
         self.look = Look(f, self.unread)
         self.states = [(self.look.key, weakref.ref(form))]
 
 
 class Reading:
-    """A function that reads lists, dicts or arrays: it notes which of them it changes itself, when it is traced."""
+    """A function that reads lists, dicts or arrays. When it is traced, it notes which of them it changes itself."""
 
     def __init__(self, form, f, known, look):
         functools.update_wrapper(self, f, updated=())
@@ -183,27 +185,27 @@ class Reading:
 
 
 class Kind:
-    """A function, whatever some arrays hold that it reads: these are data of its programs. Made by `with_data`."""
+    """A function for any values of some arrays that it reads, which are data of its programs. Made by `with_data`."""
 
     def __init__(self, f, known):
         self.f, self.known, self.arrays = f, known, []
 
     def of(self, arrays):
-        """The function that reads these arrays, tracers among them."""
+        """The function that reads these arrays, which may be tracers."""
         return Copies(dict(zip(map(id, self.arrays), arrays, strict=True))).of(self.f)
 
     def refuse(self):
-        """Arrays that cannot be traced are no data, here and later."""
+        """Marks arrays that cannot be traced: they are not data, now and later."""
         self.known.are_data = False
 
 
 def with_data(f) -> tuple[Kind, list] | None:
-    """What stands for f, and the arrays of floats that it reads and that differ from those of its first program, which
-    are data. None where there is none: what a function reads stays part of its program as long as nothing changes.
+    """The form of f, and the float arrays that it reads and that differ from those of its first program, which become
+    data. None if there are none: what a function reads stays part of its program as long as nothing changes.
 
-    What is computed from the data is traced with them. So an array stays part of the program where f could find it, or
-    keep it, elsewhere: where a way to it leads not through globals, cells and partials, and where f changes what it
-    reads. So it does where a tracer could mean another thing: where kinds are asked for.
+    Everything computed from the data is traced with them. An array therefore stays part of the program if f could reach
+    or keep it in another way: through anything but globals, cells and partials, or if f changes what it reads. It also
+    stays if a tracer could behave differently from an array: if types are checked.
     """
     current(f)
     known = _entries.get(id(f), (None, None))[1]
@@ -233,15 +235,15 @@ COPIED = types.FunctionType, types.MethodType, partial
 
 
 def again(f):
-    """The same function as another object, and so are the user's functions that it calls: JAX keeps what a loop or a
-    branch makes of a function by its identity, too."""
+    """The function as a new object, together with new objects for the user's functions that it calls. JAX also keeps
+    the bodies of loops and branches by the identity of functions."""
     if not isinstance(f, COPIED):
         f = types.MethodType(type(f).__call__, f)
     return Copies().of(f)
 
 
 class _Globals(dict):
-    """Those of a function, some of them others."""
+    """The cells of a function, some of them replaced."""
 
     def __init__(self, usual):
         super().__init__({name: usual[name] for name in ("__name__", "__builtins__") if name in usual})
@@ -252,9 +254,9 @@ class _Globals(dict):
 
 
 class Copies:
-    """Of functions, as they are made.
+    """Copies of functions, made on demand.
 
-    others: by the id of an array, what the copies read in its place; placed: in how many places they do.
+    others: by the id of an array, what the copies read instead; placed: in how many places they do so.
     """
 
     def __init__(self, others=None):
@@ -263,7 +265,7 @@ class Copies:
         self.made = {}  # by id: the copy, and the function, which keeps its id
 
     def of(self, x):
-        """The copy of a function, or what stands for an array; anything else as it is."""
+        """The copy of a function, or the replacement of an array; anything else unchanged."""
         if id(x) in self.others:
             self.placed[id(x)] += 1
             return self.others[id(x)]
@@ -306,7 +308,7 @@ class Copies:
 
 
 def _contents(f):
-    """Of its cells, None of an empty one."""
+    """The content of a cell; None if it is empty."""
     found = []
     for cell in f.__closure__ or ():
         try:

@@ -1,6 +1,6 @@
-"""How results show themselves in a notebook, a terminal, a log: shapes, dtypes and verdicts, never arrays.
+"""How results print in a notebook, a terminal or a log: shapes, dtypes and verdicts, never arrays.
 
-Nothing here computes with JAX: a result may hold tracers, or be shown while something else is being traced.
+Nothing here computes with JAX, because a result may hold tracers, or be printed while something else is being traced.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ CHARTS = {}  # how results draw themselves, by class: entered by `hhtjax`, as ch
 
 
 class Table(NamedTuple):
-    """What a result shows: a title, with the verdict, and rows, the first of which is the header."""
+    """The printed form of a result: a title with the verdict, and rows, of which the first is the header."""
 
     title: str
     rows: list[list[str]]
 
 
 def shown(cls: Kind) -> Kind:
-    """A named tuple that shows itself in one line, or by its method `_table`, and completes to its own names only.
+    """Makes a named tuple print in one line, or by its method `_table`, and complete to its own names only.
 
-    A method `_verdict` adds words to the line. Tuples they remain, for `isinstance`, comparison and `jax.tree`.
+    A method `_verdict` adds words to the line. It remains a tuple for `isinstance`, comparison and `jax.tree`.
 
     >>> @shown
     ... class Point(NamedTuple):
@@ -56,7 +56,7 @@ def line(x) -> str:
 
 
 def brief(x: PyTree) -> str:
-    """A few characters: a number as it is, an array as float64[3,2], a container by what it holds."""
+    """A few characters: a number as it is, an array as float64[3,2], a container by its contents."""
     value = known(x)
     if value is not None and not value.ndim:
         return f"{value:.6g}" if value.dtype.kind == "f" else str(value)
@@ -80,7 +80,8 @@ def _some(entries) -> str:
 
 
 def known(x: PyTree) -> Any:
-    """The numbers of an array, or a number, as NumPy's; None where they cannot be had: of a tracer, or elsewhere."""
+    """The values of an array, or a number, as a NumPy array; None if they are not available: for a tracer, or on other
+    processes."""
     if isinstance(x, bool):
         return np.asarray(x)
     if (not (is_array(x) and x.dtype == bool) and not is_real(x)) or not is_concrete(x):
@@ -91,13 +92,13 @@ def known(x: PyTree) -> Any:
 
 
 def all_known(tree: PyTree) -> list:
-    """`known` of each leaf; none of them where one is not."""
+    """`known` of each leaf; an empty list if one is not available."""
     numbers = [known(x) for x in jax.tree.leaves(tree)]
     return [] if any(x is None for x in numbers) else numbers
 
 
 def leaf_rows(**trees: PyTree):
-    """Name, shape and dtype of each array in pytrees, as rows of a table; trees that are None do not occur."""
+    """Name, shape and dtype of each array in pytrees, as rows of a table; trees that are None are omitted."""
     rows = []
     for name, tree in trees.items():
         for path, x in jax.tree_util.tree_leaves_with_path(tree):
@@ -114,7 +115,7 @@ def between(x: np.ndarray, unit: str = "", digits: int = 6) -> str:
 
 
 def _shortened(table: Table):
-    """At most `MOST` rows, and what is left out."""
+    """At most `MOST` rows, and the number of omitted ones."""
     left = len(table.rows) - 1 - MOST
     return table.rows[: MOST + 1], f"and {left} more" if left > 0 else ""
 
@@ -128,7 +129,7 @@ def as_text(table: Table) -> str:
 
 
 def as_html(table: Table) -> str:
-    """The same as HTML, in the colours around it."""
+    """The table as HTML, in the colours of the page."""
     rows, more = _shortened(table)
 
     def line(kind: str, cells: list) -> str:
@@ -139,5 +140,5 @@ def as_html(table: Table) -> str:
 
 
 def overwrite(line: str, last: bool):
-    """A line on stderr that takes the place of the one before, in a terminal as in a notebook; the last one stays."""
+    """Writes a line to stderr that replaces the previous one, in a terminal and in a notebook; the last one stays."""
     print(f"\r{line:<79}", end="\n" if last else "", file=sys.stderr, flush=True)

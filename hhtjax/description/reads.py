@@ -1,13 +1,13 @@
-"""What a function reads from outside, and whether that is still what it was.
+"""What a function reads from outside, and whether it has changed.
 
-JAX keeps a traced function by its identity: a global variable that is bound anew, another value in a closure's cell, or
-an array that is changed in place goes unnoticed. `current(f)` gives f itself as long as all that it reads is the same,
-and another function that does the same, of another identity, when something differs; so what JAX keeps of f is found
-again only where it is still right.
+JAX identifies a traced function by its identity. It does not notice a global variable with a new value, another value
+in a closure's cell, or an array that is changed in place. `current(f)` returns f itself as long as everything that it
+reads is the same. When something differs it returns another object that does the same. So JAX reuses a program of f
+only while it is correct.
 
-Looked at are cells, globals, defaults, the arguments of partials, attributes of modules, of classes and of objects,
-entries of lists and dicts, of f and of all of the user's functions that it can reach. Functions of installed packages
-are looked into for what they close over alone. What a `jit` of the user's holds is JAX's affair.
+The check covers cells, globals, defaults, the arguments of partials, attributes of modules, classes and objects, and
+entries of lists and dicts, for f and for all functions of the user that it can reach. For functions of installed
+packages only closure variables are checked. Functions inside a `jit` of the user follow JAX's own rule.
 """
 
 import dis
@@ -37,8 +37,8 @@ STORED = {"STORE_GLOBAL", "DELETE_GLOBAL", "STORE_DEREF", "DELETE_DEREF"}
 
 
 class Names(NamedTuple):
-    """What the code of a function, and of those inside it, calls by name: globals that it reads, attributes, and the
-    globals and cells that it writes, which are no data."""
+    """The names that the code of a function, and of functions inside it, uses: globals and attributes that it reads,
+    and the globals and cells that it writes, which are not data."""
 
     read: tuple
     attributes: frozenset
@@ -72,7 +72,7 @@ def _is_installed(path):
 
 
 def is_users(x):
-    """Whether a function, a class or a module is the user's, and of no installed package."""
+    """Whether a function, a class or a module belongs to the user, and not to an installed package."""
     if isinstance(x, types.FunctionType):
         return not _is_installed(x.__code__.co_filename)
     module = x if isinstance(x, types.ModuleType) else sys.modules.get(getattr(x, "__module__", None) or "")
@@ -82,12 +82,12 @@ def is_users(x):
 
 
 def _is_fixed(x):
-    """Whether it is an installed module, such as jax.numpy, which nobody replaces by another."""
+    """Whether it is an installed module, such as jax.numpy, which is never replaced."""
     return isinstance(x, types.ModuleType) and not is_users(x)
 
 
 class Same:
-    """An object as a key, by its identity, which keeps nothing alive."""
+    """An object as a key, by its identity, without keeping it alive."""
 
     __slots__ = ("hash", "ref")
 
@@ -106,7 +106,7 @@ class Same:
 
 
 def held(x):
-    """What a container, an object or an array holds now."""
+    """The present contents of a container, an object or an array."""
     if isinstance(x, np.ndarray):
         return x.tobytes()
     x = x if isinstance(x, CONTAINERS) else vars(x)
@@ -127,17 +127,17 @@ def _no(f):
 
 
 class Look:
-    """All that a function reads, and a program that looks whether it is the same.
+    """Everything that a function reads, and a program that checks whether it is unchanged.
 
-    Every call of `simulate` looks, so the program is written as Python, of a line for a value: that takes 0.1 us, where
-    a walk over all values takes 0.7.
+    Every call of `simulate` makes this check. It is therefore generated as Python code with one line for each value,
+    which takes 0.1 us per value; walking over all values takes 0.7.
 
-    holds: of the function, what it reads and could change itself, and its `arrays`; None where something differs.
-    key: equal to that of another look where the programs that JAX makes of the function are the same.
+    holds: returns the things that the function reads and could change itself, and its `arrays`; None if something
+    differs. key: equal keys mean that JAX's programs of the function are the same.
     """
 
     def __init__(self, f, unread=()):
-        """unread: containers that the function itself changes, such as a list that it appends to."""
+        """unread: containers that the function itself changes, such as a list to which it appends."""
         self.unread = unread
         self.values, self.names, self.lines = [f], ["f"], []
         self.given = set()  # ids of the keywords of partials, of which the function gets copies
@@ -158,14 +158,14 @@ class Look:
         del self.values, self.names, self.lines, self.space, self._seen
 
     def _program(self):
-        """Of the lines; what is of another kind than it was may raise anything."""
+        """Compiles the lines. A value of another type than before may raise any error, which counts as a difference."""
         changed, arrays = ("".join(f"{name}, " for name in names) for names in (self.may_change, self.arrays))
         body = "".join(f"  {line}\n" for line in [*self.lines, f"return ({changed}), ({arrays})"])
         exec(f"def holds(f):\n try:\n{body} except Exception:\n  return None", self.space)
         return self.space["holds"]
 
     def _read(self, i, *suffixes):
-        """Values that the one at i has: an expression for each."""
+        """The values inside the one at i: an expression for each."""
         first = len(self.values)
         for n, suffix in enumerate(suffixes, first):
             x = _reader(suffix)(self.values[i])
@@ -176,7 +176,7 @@ class Look:
         return first
 
     def _read_entries(self, i, x, suffix="", may_change=True):
-        """All that a container holds; with suffix, one that the value at i has."""
+        """Everything inside a container; with suffix, inside a container that belongs to the value at i."""
         found, n, name = _entries(x), len(self.lines), self.names[i] + suffix  # an empty one adds no value, but a line
         entries = f"[*{name}, *{name}.values()]" if isinstance(x, dict) else f"[*{name}]"
         self.lines.append(f"if [*map(id, y{n} := {entries})] != known{n}: return None")
@@ -250,7 +250,8 @@ class Look:
             self._read_attributes(self._read(i, *(f".__globals__[{name!r}]" for name in read)), names.attributes)
 
     def _read_attributes(self, first, names, depth=3):
-        """What may be read of the user's modules among the latest values, by the names that a function mentions."""
+        """The values of the user's modules that may be read, among the latest values, by the names that a function
+        mentions."""
         for i in range(first, len(self.values)):
             x = self.values[i]
             if depth and isinstance(x, types.ModuleType) and is_users(x):
@@ -284,7 +285,8 @@ class Look:
             self._read(i, ".__class__")
 
     def _watch(self):
-        """Ids are compared, and nothing kept alive that could not die for it: who dies breaks the look."""
+        """Ids are compared. Objects are kept alive only if they could die without this; an object that has died makes
+        the check fail."""
         me = weakref.ref(self)
 
         def broken(_):

@@ -1,26 +1,28 @@
 """Finite elements: beams, cables, springs and joints, as plain functions of one element.
 
-A structure is nodes, and elements between them. The state q is a dict whose leaves have the nodes as first axis. What
-leaves it has depends on the elements:
+A structure consists of nodes, and of elements between them. The state q is a dict; the first axis of its leaves counts
+the nodes. The elements determine which leaves it has:
 
-    bars, springs          {"r": (N, d)}                             places, m; d = 2 or 3
-    bodies in the plane    {"r": (N, 2), "theta": (N,)}              places, m, and angles, rad
-    bodies in space        {"r": (N, 3), "R": (N, 3, 3)}             places, m, and rotations; see `hhtjax.rotation`
-    ANCF cables            {"r": (N, d), "slope": (N, d)}            places, m, and slopes dr/dx
+    bars, springs          {"r": (N, d)}                             positions, m; d = 2 or 3
+    bodies in the plane    {"r": (N, 2), "theta": (N,)}              positions, m, and angles, rad
+    bodies in space        {"r": (N, 3), "R": (N, 3, 3)}             positions, m, and rotations; see `hhtjax.rotation`
+    ANCF cables            {"r": (N, d), "slope": (N, d)}            positions, m, and slopes dr/dx
 
-v is like q, but for rotations: its leaf "R" is (N, 3), the angular velocity Om in material components, Rdot = R
-hat(Om). Forces are like v: moments in the plane under "theta", in material components under "R".
+v is structured like q, except for rotations: its leaf "R" is (N, 3), the angular velocity Om in material components,
+with Rdot = R hat(Om). Forces are structured like v: "theta" holds moments in the plane, "R" moments in material
+components.
 
-A function sees one element: q and v of its k nodes alone, with leaves (k, ...), and `each`, a dict of what this element
-holds: lengths, stiffnesses. There are three kinds:
+A function computes one element. It receives q and v of its k nodes only, with leaves (k, ...), and `each`, a dict with
+the data of this element: lengths, stiffnesses. There are three kinds:
 
     force    f(q, v, t, params, each)    the force on its nodes, like v: -dV/dq of an energy V
     mass     m(q, w, params, each)       M w of an acceleration w, like v
-    joint    j(q, t, params, each)       rows that are 0 where the joint holds
+    joint    j(q, t, params, each)       rows that are 0 if the joint is closed
 
-A result may lack leaves that it has nothing in. One `each` may serve several functions of this room: names that another
-one needs are let through, and a name that none knows is an error. Functions of your own are elements just as well.
-`jax.vmap` calls one for many elements. All take `jit`, `grad` and `jacfwd`, also where nothing is deformed.
+A result may omit leaves that are zero. One `each` may serve several functions of this folder: names that another
+function needs are accepted, and an unknown name is an error. You can use your own functions as elements in the same
+way. `jax.vmap` evaluates a function for many elements. All functions support `jit`, `grad` and `jacfwd`, also in the
+undeformed state.
 
 A beam of two elements, clamped at one end, bent into a quarter of a circle by the moment EI pi/(2 length) at the other:
 
@@ -41,11 +43,11 @@ A beam of two elements, clamped at one end, bent into a quarter of a circle by t
 Which element
 -------------
 
-`planar_beam` and `spatial_beam` are geometrically exact: they stretch, shear, bend and twist by any amount. They
-converge with order 2. Their nodes are bodies, to which joints can be fixed. `ancf_cable` is for what is thin: it has no
-shear and no twist, and its mass is constant without rotations. It converges with order 4 on fine meshes. `truss` and
-`spring_damper` pull along a line, `torsion_spring` turns. Weight is `gravity`. Nodes that turn in space need
-`gyroscopic`.
+`planar_beam` and `spatial_beam` are geometrically exact: stretch, shear, bending and twist may be arbitrarily large.
+They converge with order 2. Their nodes are bodies, to which joints can be attached. `ancf_cable` is for thin cables and
+beams: it has no shear and no twist, and its mass is constant and has no rotations. It converges with order 4 on fine
+meshes. `truss` and `spring_damper` act along a line, `torsion_spring` about an axis. `gravity` is the weight. Nodes
+that rotate in space need `gyroscopic`.
 
 The mass of beams is `planar_mass` or `spatial_mass`, consistent with their shape, or diagonal: `planar_lumped_mass`,
 `spatial_lumped_mass`. Lumped masses make steps cheaper; both converge with order 2. ANCF cables need `ancf_mass`.
@@ -53,8 +55,8 @@ The mass of beams is `planar_mass` or `spatial_mass`, consistent with their shap
 Joints
 ------
 
-`pin` (a ball joint in space), `weld`, `revolute`, `slider`, `prismatic` and `rigid_link` hold two bodies together. With
-one node, they hold a body to the ground. Points of bodies are given by offsets, "a" on the first and "b" on the second.
+`pin` (a ball joint in space), `weld`, `revolute`, `slider`, `prismatic` and `rigid_link` connect two bodies. With one
+node they connect a body to the ground. Points of bodies are given by offsets, "a" on the first and "b" on the second.
 """
 
 from hhtjax.elements.ancf import ancf_cable, ancf_mass

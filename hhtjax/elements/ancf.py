@@ -13,25 +13,27 @@ POINTS = 3  # of Gauss: two would let one stretching go without a force, five lo
 
 
 def ancf_cable(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> dict:
-    """The force of a thin cable or beam that stretches and bends by any amount, without shear, twist and rotations.
+    """The force of a thin cable or beam with large stretch and bending, without shear and twist; no rotations are
+    needed.
 
-    The place r(x), 0 <= x <= L, is the cubic with the ends r_1, r_2 and the slopes r'_1, r'_2 (dr/dx, of length 1 where
+    The position r(x), 0 <= x <= L, is the cubic with the ends r_1, r_2 and the slopes r'_1, r'_2 (dr/dx, of length 1 if
+    nothing is stretched). The force is -dV/dq of
     nothing is stretched). The force is -dV/dq of
 
         V = int EA/2 eps^2 + EI/2 kappa^2 dx,    eps = |r'| - 1,    kappa = |r' x r''|/|r'|^2
 
-    by 3 points of Gauss. kappa is the turn per length at rest, so EI kappa is the moment of a stretched cable, too.
-    (With eps = (|r'|^2 - 1)/2 and the curvature |r' x r''|/|r'|^3 of the deformed line, the tip of a cantilever that
-    is stretched by .0006 goes a thousandth too far.)
-    Displacements converge with order 4 in L, once an element turns by less than some .1 rad. Coarse meshes are too
-    stiff: stretch and bending of cubics are not independent. |r'| must not be 0.
+    integrated with 3 Gauss points. kappa is the rotation per undeformed length, so EI kappa is the moment of a
+    stretched cable, too. (With eps = (|r'|^2 - 1)/2 and the curvature |r' x r''|/|r'|^3 of the deformed line, the tip
+    of a cantilever that is stretched by .0006 moves a thousandth too far.) Displacements converge with order 4 in L,
+    once an element rotates by less than about .1 rad. Coarse meshes are too stiff, because stretch and bending of
+    cubics are not independent. |r'| must not be 0.
 
     Args:
-        q: {"r": (2, d) in m, "slope": (2, d), without unit} of two nodes. v: not used.
+        q: {"r": (2, d) in m, "slope": (2, d), dimensionless} of two nodes. v: not used.
         t, params: not used.
-        each: "L", m, the length at rest; "EA", N; "EI", N m^2.
+        each: "L", m, the undeformed length; "EA", N; "EI", N m^2.
 
-    Returns: {"r": (2, d) in N, "slope": (2, d) in N m}: what acts on the nodes.
+    Returns: {"r": (2, d) in N, "slope": (2, d) in N m}: the force on the nodes.
     Raises: TypeError, ValueError: leaves or numbers that are missing, misspelt, or of another shape.
 
     References:
@@ -64,7 +66,7 @@ def ancf_cable(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> 
 
 
 def ancf_mass(q: PyTree, w: PyTree, params: PyTree, each: PyTree) -> dict:
-    """M w of an `ancf_cable`: rhoA int S^T S dx with its cubic shape functions S; constant, and exact.
+    """M w of an `ancf_cable`: rhoA int S^T S dx with its cubic shape functions S. M is constant, and exact.
 
     Args:
         q, w: {"r": (2, d), "slope": (2, d)} of two nodes; accelerations.
@@ -88,7 +90,7 @@ def ancf_mass(q: PyTree, w: PyTree, params: PyTree, each: PyTree) -> dict:
 def slopes(points: int, dtype: np.dtype) -> tuple:
     """dS/ds and d^2S/ds^2 of the shape functions S at Gauss points of (0, 1), (points, 4) each, and the weights.
 
-    S belongs to (r_1, L r'_1, r_2, L r'_2), and s = x/L.
+    S multiplies (r_1, L r'_1, r_2, L r'_2), and s = x/L.
     """
     s, weights = np.polynomial.legendre.leggauss(points)
     s = (s + 1) / 2

@@ -1,4 +1,4 @@
-"""Checks of what the functions of elements are given, made while tracing: the nodes, and the numbers of an element."""
+"""Checks of the arguments of element functions, made while tracing: the nodes, and the data of an element."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ KNOWN = {  # what an element of this room may hold, so that a misspelt name is n
 
 
 def require_nodes(caller: str, q: PyTree, **shapes: tuple):
-    """An error unless the dict q has these leaves in these shapes."""
+    """Raises an error unless the dict q has these leaves in these shapes."""
     if not isinstance(q, dict) or not shapes.keys() <= q.keys():
         raise ValueError(f"{caller}: `q` must be a dict with the leaves {sorted(shapes)}; received {_keys(q)}.")
     for name, shape in shapes.items():
@@ -23,12 +23,12 @@ def require_nodes(caller: str, q: PyTree, **shapes: tuple):
 
 
 def shape_of(q: PyTree, name: str) -> tuple:
-    """The shape of a leaf; (0, 0) where there is none, which `require_nodes` then tells."""
+    """The shape of a leaf; (0, 0) if it is missing, which `require_nodes` then reports."""
     return (jnp.shape(q[name]) if isinstance(q, dict) and name in q else ()) or (0, 0)
 
 
 def require_each(caller: str, each: PyTree, *needed: str):
-    """An error for an `each` that lacks a name, or has one that no element knows."""
+    """Raises an error if `each` lacks a name, or has one that no element knows."""
     if not isinstance(each, dict) or not each.keys() >= set(needed):
         raise ValueError(f"{caller}: `each` must be a dict with {sorted(needed)}; received {_keys(each)}.")
     if unknown := each.keys() - KNOWN:
@@ -36,7 +36,7 @@ def require_each(caller: str, each: PyTree, *needed: str):
 
 
 def number(caller: str, each: PyTree, name: str, like: Array, shape: tuple = ()) -> jax.Array:
-    """What an element holds under a name, in the dtype of an array."""
+    """An entry of `each`, in the dtype of an array."""
     value: Real = each[name]
     if not is_real(value) and not is_array(value):
         raise TypeError(f"{caller}: `each[{name!r}]` must be real; received {value!r}.")

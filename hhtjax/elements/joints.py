@@ -1,9 +1,9 @@
-"""Joints in the plane and in space: functions that are 0 where the joint holds.
+"""Joints in the plane and in space: functions that are 0 if the joint is closed.
 
-A joint holds together two bodies, which are nodes {"r": (2,), "theta": ()} or {"r": (3,), "R": (3, 3)}. Given one node,
-it takes the ground as the second body, whose frame is that of space. Of each body it holds a point, x_1 = r_1 + A_1 a
-and x_2 = r_2 + A_2 b, with A = R or the rotation by theta, and with offsets a and b in the frame of the body. Nodes
-that have only "r" have no frame, and so no offset; the ground has one.
+A joint connects two bodies, which are nodes {"r": (2,), "theta": ()} or {"r": (3,), "R": (3, 3)}. With one node, the
+second body is the ground, whose frame is the frame of space. The joint acts on one point of each body, x_1 = r_1 + A_1
+a and x_2 = r_2 + A_2 b, with A = R or the rotation by theta, and with offsets a and b in the frame of the body. Nodes
+with only "r" have no frame, and so no offset; the ground has one.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from hhtjax.numerics.dense_lu import matvec
 
 
 def pin(q: PyTree, t: Array, params: PyTree, each: PyTree | None = None) -> Array:
-    """x_1 - x_2: keeps two points together. A pin in the plane, 2 rows; a ball joint in space, 3 rows.
+    """x_1 - x_2: keeps two points together. In the plane a pin, 2 rows; in space a ball joint, 3 rows.
 
     Args:
-        q: of two nodes, {"r": (2, 2), "theta": (2,)} in the plane, {"r": (2, 3), "R": (2, 3, 3)} in space; of one node,
-            the ground is the second body.
+        q: of two nodes, {"r": (2, 2), "theta": (2,)} in the plane, {"r": (2, 3), "R": (2, 3, 3)} in space; with one
+            node, the ground is the second body.
         t, params: not used.
-        each: None, or "a" and "b", (d,), m, if need be: the points in the frames of the first and the second body.
+        each: None, or optionally "a" and "b", (d,), m: the points in the frames of the first and the second body.
 
-    Returns: (d,), in m: 0 where the joint holds.
+    Returns: (d,), in m: 0 if the joint is closed.
     Raises: TypeError, ValueError: leaves or numbers that are missing, misspelt, or of another shape.
 
-    Example: the end of a rod that stands upright, pinned to the ground in (1, 2).
+    Example: the end of an upright rod, pinned to the ground at (1, 2).
 
     >>> q = {"r": jnp.array([[1.0, 1.5]]), "theta": jnp.array([jnp.pi / 2])}
     >>> print(pin(q, 0.0, {}, {"a": jnp.array([0.5, 0.0]), "b": jnp.array([1.0, 2.0])}).round(6) + 0.0)
@@ -40,16 +40,16 @@ def pin(q: PyTree, t: Array, params: PyTree, each: PyTree | None = None) -> Arra
 
 
 def weld(q: PyTree, t: Array, params: PyTree, each: PyTree | None = None) -> Array:
-    """`pin`, and no rotation of one body beside the other: 3 rows in the plane, 6 in space.
+    """`pin`, and no rotation of one body relative to the other: 3 rows in the plane, 6 in space.
 
-    Turned are rows theta_2 - theta_1 - frame in the plane, and those of the skew part of R_1^T R_2 frame^T in space.
+    The rotation rows are theta_2 - theta_1 - frame in the plane, and the skew part of R_1^T R_2 frame^T in space.
 
     Args:
         q, t, params: as in `pin`.
-        each: as in `pin`, and "frame", if need be: how the second body stands in the frame of the first, an angle in
-            rad in the plane, a rotation (3, 3) in space.
+        each: as in `pin`, and optionally "frame": the orientation of the second body in the frame of the first, an
+            angle in rad in the plane, a rotation (3, 3) in space.
 
-    Returns: (3,) or (6,), in m and rad: 0 where the joint holds.
+    Returns: (3,) or (6,), in m and rad: 0 if the joint is closed.
     Raises: TypeError, ValueError: as `pin`.
 
     >>> q = {"r": jnp.zeros((2, 2)), "theta": jnp.array([0.1, 0.4])}
@@ -62,16 +62,17 @@ def weld(q: PyTree, t: Array, params: PyTree, each: PyTree | None = None) -> Arr
 
 
 def revolute(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
-    """A hinge in space: `pin`, and one axis of both bodies; 5 rows.
+    """A hinge in space: `pin`, and a common axis of both bodies; 5 rows.
 
-    The last two are components, across the axis of the second body, of the axis of the first in its frame.
+    The last two rows are the components of the axis of the first body perpendicular to the axis of the second, in the
+    frame of the second.
 
     Args:
         q, t, params: as in `pin`, in space.
-        each: as in `weld`, and "axis", (3,): the axis in the frame of the second body. That in the frame of the first
-            is `frame` axis.
+        each: as in `weld`, and "axis", (3,): the axis in the frame of the second body. In the frame of the first it is
+            `frame` axis.
 
-    Returns: (5,), in m and rad: 0 where the joint holds.
+    Returns: (5,), in m and rad: 0 if the joint is closed.
     Raises: TypeError, ValueError: as `pin`.
 
     >>> q = {"r": jnp.zeros((2, 3)), "R": jnp.stack([jnp.eye(3), rotation.exp(jnp.array([0.0, 0.0, 2.0]))])}
@@ -86,18 +87,18 @@ def revolute(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
 
 
 def slider(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
-    """Keeps a point of the first body on a line of the second: 1 row in the plane, 2 in space. The body may turn.
+    """Keeps a point of the first body on a line of the second: 1 row in the plane, 2 in space. The body may rotate.
 
-    Components, across the axis, of A_2^T (x_1 - x_2).
+    The rows are the components of A_2^T (x_1 - x_2) perpendicular to the axis.
 
     Args:
         q, t, params: as in `pin`.
         each: as in `pin`, and "axis", (d,): the direction of the line through b, in the frame of the second body.
 
-    Returns: (d - 1,), in m: 0 where the joint holds.
+    Returns: (d - 1,), in m: 0 if the joint is closed.
     Raises: TypeError, ValueError: as `pin`.
 
-    Example: a place on the ground's line y = 1.
+    Example: the distance of a point from the line y = 1 on the ground.
 
     >>> each = {"axis": jnp.array([1.0, 0.0]), "b": jnp.array([0.0, 1.0])}
     >>> print(slider({"r": jnp.array([[3.0, 1.2]])}, 0.0, {}, each).round(6))
@@ -109,13 +110,13 @@ def slider(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
 
 
 def prismatic(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
-    """A slide: `slider`, and no rotation of one body beside the other; 2 rows in the plane, 5 in space.
+    """A prismatic joint: `slider`, and no rotation of one body relative to the other; 2 rows in the plane, 5 in space.
 
     Args:
         q, t, params: as in `pin`.
         each: as in `weld`, and "axis", (d,): the direction of the line through b, in the frame of the second body.
 
-    Returns: (2,) or (5,), in m and rad: 0 where the joint holds.
+    Returns: (2,) or (5,), in m and rad: 0 if the joint is closed.
     Raises: TypeError, ValueError: as `pin`.
 
     >>> q = {"r": jnp.array([[3.0, 0.0]]), "theta": jnp.array([0.1])}
@@ -126,13 +127,13 @@ def prismatic(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
 
 
 def rigid_link(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
-    """(|x_1 - x_2|^2 - L^2)/(2 L): keeps two points in a distance, a rod without mass; 1 row.
+    """(|x_1 - x_2|^2 - L^2)/(2 L): keeps two points at a distance L, a massless rod; 1 row.
 
     Args:
-        q, t, params: as in `pin`; nodes that have only "r", too.
-        each: as in `pin`, and "L", m: the distance, which is not 0.
+        q, t, params: as in `pin`; also nodes with only "r".
+        each: as in `pin`, and "L", m: the distance, not 0.
 
-    Returns: (1,), in m: 0 where the joint holds.
+    Returns: (1,), in m: 0 if the joint is closed.
     Raises: TypeError, ValueError: as `pin`.
 
     >>> print(rigid_link({"r": jnp.array([[3.0, 4.0]])}, 0.0, {}, {"L": 5.0}))
@@ -145,7 +146,7 @@ def rigid_link(q: PyTree, t: Array, params: PyTree, each: PyTree) -> Array:
 
 
 def across(axis: Array) -> Array:
-    """Unit vectors (d - 1, d) at right angles to an axis (d,), and to one another.
+    """Unit vectors (d - 1, d) perpendicular to an axis (d,), and to each other.
 
     In space: T. Duff et al., Building an orthonormal basis, revisited, J. Comput. Graph. Tech. 6(1), 2017, 1-8.
     """
@@ -180,7 +181,7 @@ def _bodies(caller: str, q: PyTree, each: PyTree):
 
 
 def _rotations(caller: str, q: PyTree) -> list:
-    """A_1 and A_2, with that of the ground where there is one node."""
+    """A_1 and A_2, where A_2 is that of the ground if there is one node."""
     k, d = q["r"].shape
     name, shape = ("theta", (k,)) if d == 2 else ("R", (k, 3, 3))
     require_nodes(caller, q, **{name: shape})
@@ -193,7 +194,8 @@ def _rotations(caller: str, q: PyTree) -> list:
 
 
 def _turn(caller: str, q: PyTree, each: PyTree) -> Array:
-    """How the second body is turned beside the first and `frame`: (1,) in the plane, (3,) in space; rad where small."""
+    """The rotation of the second body relative to the first and `frame`: (1,) in the plane, (3,) in space; in rad if
+    small."""
     if q["r"].shape[1] == 2:
         require_nodes(caller, q, theta=q["r"].shape[:1])
         theta = q["theta"]

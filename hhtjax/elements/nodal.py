@@ -1,4 +1,4 @@
-"""What acts on nodes by themselves: weight, and the moment of a body that turns."""
+"""Forces on single nodes: weight, and the gyroscopic moment of a rotating body."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from hhtjax.numerics.dense_lu import matvec
 
 
 def gravity(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> dict:
-    """The weight of an element: m g, in equal parts at its nodes.
+    """The weight of an element: m g, distributed equally over its nodes.
 
-    With one node it is that of a body whose centre of mass is the node. On two nodes of an ANCF cable, whose load is
-    shared by the cubic shape functions, the slopes have m L g/12 and -m L g/12, too.
+    With one node it is the weight of a body whose centre of mass is the node. On two nodes of an ANCF cable, the cubic
+    shape functions distribute the load, and the slopes get m L g/12 and -m L g/12, too.
 
     Args:
-        q: {"r": (k, d)} of k nodes, and "slope" where they have one. v, t: not used.
-        params: "gravity", (d,), m/s^2: g, towards the ground.
-        each: "m", kg: of the element, for a beam rhoA L. "L", m, where nodes have slopes.
+        q: {"r": (k, d)} of k nodes, and "slope" if they have one. v, t: not used.
+        params: "gravity", (d,), m/s^2: the vector g, which points downwards.
+        each: "m", kg: of the element, for a beam rhoA L. "L", m, if nodes have slopes.
 
-    Returns: {"r": (k, d) in N}, and "slope" (k, d), in N m, where nodes have one.
+    Returns: {"r": (k, d) in N}, and "slope" (k, d), in N m, if nodes have one.
     Raises: TypeError, ValueError: leaves or numbers that are missing, misspelt, or of another shape.
 
     >>> q = {"r": jnp.zeros((2, 3)), "R": jnp.stack([jnp.eye(3)] * 2)}
@@ -43,12 +43,12 @@ def gravity(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> dic
 
 
 def gyroscopic(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> dict:
-    """-Om x J Om, in N m, on each node of an element: what a rigid body has by turning.
+    """-Om x J Om, in N m, on each node of an element: the gyroscopic moment of a rotating rigid body.
 
     Args:
         q, v: of k nodes, {"R": (k, 3, 3)}; {"R": (k, 3)}, material angular velocities, rad/s.
         t, params: not used.
-        each: "J", kg m^2: (3, 3), the inertia of a node about it in its own frame, or (3,), its diagonal.
+        each: "J", kg m^2: (3, 3), the inertia about the node in its own frame, or (3,), its diagonal.
 
     Returns: {"R": (k, 3) in N m}, in material components.
     Raises: TypeError, ValueError: leaves or numbers that are missing, misspelt, or of another shape.

@@ -13,26 +13,27 @@ STIFFNESS = "EA", "GA", "EI"
 
 
 def planar_beam(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> dict:
-    """The force of a beam in the plane that stretches, shears and bends by any amount.
+    """The force of a beam in the plane with arbitrarily large stretch, shear and bending.
 
-    Two nodes, places and angles in between linear, one point of integration in the middle, so that thin elements do
-    not lock. With the angle theta_m = (theta_1 + theta_2)/2 + frame and its rotation A, the strains (`planar_strain`)
+    It has two nodes; positions and angles are linear in between. One integration point in the middle prevents locking
+    of thin elements. With the angle theta_m = (theta_1 + theta_2)/2 + frame and its rotation A, the strains
+    (`planar_strain`)
 
         Gamma = A^T (r_2 - r_1)/L - (1, 0),    kappa = (theta_2 - theta_1)/L
 
-    hold the energy V = L/2 (EA Gamma_1^2 + GA Gamma_2^2 + EI kappa^2), and the force is -dV/dq. A rigid motion turns
-    the force, and changes no strain. Damping adds `damping` times their rates to the strains.
+    have the energy V = L/2 (EA Gamma_1^2 + GA Gamma_2^2 + EI kappa^2), and the force is -dV/dq. A rigid motion rotates
+    the force, and changes no strain. With damping, strains are replaced by strains plus `damping` times their rates.
     Displacements converge with order 2 in L. Under a moment at its end, the angles are exact with any number of
     elements.
 
     Args:
         q, v: {"r": (2, 2) in m, "theta": (2,) in rad} of two nodes; their rates.
         t, params: not used.
-        each: "L", m, the length at rest; "EA" and "GA", N, the latter with the shear factor in it; "EI", N m^2.
-            If need be, "damping", s: of the material; "frame", rad: the angle of the beam where its nodes have the
-            angle 0; "rest", (3,): the strains at rest, of `planar_strain`.
+        each: "L", m, the undeformed length; "EA" and "GA", N, where GA includes the shear factor; "EI", N m^2.
+            Optional: "damping", s: of the material; "frame", rad: the angle of the beam when its nodes have the angle
+            0; "rest", (3,): the strains in the stress-free state, from `planar_strain`.
 
-    Returns: {"r": (2, 2) in N, "theta": (2,) in N m}: what acts on the nodes.
+    Returns: {"r": (2, 2) in N, "theta": (2,) in N m}: the force on the nodes.
     Raises: TypeError, ValueError: leaves or numbers that are missing, misspelt, or of another shape.
 
     Reference: E. Reissner, On one-dimensional finite-strain beam theory: the plane problem, Z. Angew. Math. Phys. 23,
@@ -54,12 +55,12 @@ def planar_beam(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) ->
 
 
 def planar_strain(q: PyTree, each: PyTree) -> jax.Array:
-    """(Gamma_1, Gamma_2, kappa) of a `planar_beam`: stretch and shear, without unit, and curvature, 1/m.
+    """(Gamma_1, Gamma_2, kappa) of a `planar_beam`: stretch and shear, dimensionless, and curvature, 1/m.
 
-    Times EA, GA and EI, they are the normal force, the shear force and the moment. Those of the undeformed nodes, put
-    into `each` as "rest", make a beam that is curved at rest.
+    Multiplied by EA, GA and EI, they are the normal force, the shear force and the moment. For a beam that is curved in
+    its stress-free state, put its strains in that state into `each` as "rest".
 
-    Args: q, each: as in `planar_beam`; without stiffnesses, too.
+    Args: q, each: as in `planar_beam`; stiffnesses are not needed.
     Returns: (3,).
     Raises: TypeError, ValueError: as `planar_beam`.
 
@@ -71,7 +72,7 @@ def planar_strain(q: PyTree, each: PyTree) -> jax.Array:
 
 
 def planar_mass(q: PyTree, w: PyTree, params: PyTree, each: PyTree) -> dict:
-    """M w of a `planar_beam`, consistent with its linear interpolation: exact for rigid motions.
+    """M w of a `planar_beam`, consistent with its linear interpolation; exact for rigid motions.
 
         M = rhoA L/6 [[2, 1], [1, 2]] on r, and the same with rhoI on theta
 
@@ -95,12 +96,12 @@ def planar_mass(q: PyTree, w: PyTree, params: PyTree, each: PyTree) -> dict:
 
 
 def planar_lumped_mass(nodes: Array, each: PyTree, num_nodes: int) -> dict:
-    """The diagonal mass of beams in the plane, for all of them at once: half of each goes to either node.
+    """The diagonal mass of all beams in the plane together: half of each beam goes to either node.
 
     Args:
         nodes: (E, 2), integers: the nodes of each beam.
         each: "L", m; "rhoA", kg/m; "rhoI", kg m; each a number or (E,).
-        num_nodes: N, of the whole system.
+        num_nodes: N, the number of nodes of the system.
 
     Returns: {"r": (N, 2) in kg, "theta": (N,) in kg m^2}.
     Raises: ValueError: numbers that are missing or misspelt.
@@ -115,20 +116,20 @@ def planar_lumped_mass(nodes: Array, each: PyTree, num_nodes: int) -> dict:
 
 
 def between(x: Array) -> jax.Array:
-    """[[2, 1], [1, 2]]/6 on the first axis, that of two nodes."""
+    """[[2, 1], [1, 2]]/6, applied to the first axis, which counts two nodes."""
     return (x + jnp.sum(x, axis=0, keepdims=True)) / 6
 
 
 def lumped(nodes: Array, half: Array, num_nodes: int) -> jax.Array:
-    """(N,), the sums of the halves of elements at their nodes."""
+    """(N,), the halves of elements, summed at their nodes."""
     nodes = jnp.asarray(nodes)
     half = jnp.broadcast_to(half, nodes.shape[:1])
     return jnp.zeros(num_nodes, half.dtype).at[nodes].add(jnp.stack([half, half], axis=1))
 
 
 def _kinematics(caller: str, q: PyTree, each: PyTree, stiffness: tuple):
-    """The strains (3,), their rates as a function of v, and the force on the nodes as one of what works on the strains:
-    -L times the transpose of the rates."""
+    """The strains (3,); their rates as a function of v; and the force on the nodes as a function of the stresses, which
+    is -L times the transpose of the rates."""
     require_nodes(caller, q, r=(2, 2), theta=(2,))
     require_each(caller, each, "L", *stiffness)
     r, theta = q["r"], q["theta"]

@@ -16,33 +16,36 @@ STIFFNESS = "EA", "GAy", "GAz", "GJ", "EIy", "EIz"
 
 
 def spatial_beam(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> dict:
-    """The force of a beam in space that stretches, shears, bends and twists by any amount.
+    """The force of a beam in space with arbitrarily large stretch, shear, bending and twist.
 
-    x of the beam's frame (R of a node, or R frame) is its axis; y and z are the principal axes of its section. Two
-    nodes, one point of integration in the middle, so that thin elements do not lock. In between, places are linear, and
-    rotations R(s) = R_1 exp(s psi), psi = log(R_1^T R_2). With R_m, that in the middle, the strains (`spatial_strain`)
+    The x axis of the beam's frame (R of a node, or R frame) is the beam's axis; y and z are the principal axes of its
+    cross-section. The beam has two nodes. One integration point in the middle prevents locking of thin elements. In
+    between, positions are linear, and rotations are R(s) = R_1 exp(s psi), psi = log(R_1^T R_2). With R_m, the rotation
+    in the middle, the strains (`spatial_strain`)
 
         Gamma = R_m^T (r_2 - r_1)/L - (1, 0, 0),    kappa = psi/L
 
-    hold the energy
+    have the energy
 
         V = L/2 (EA Gamma_x^2 + GAy Gamma_y^2 + GAz Gamma_z^2 + GJ kappa_x^2 + EIy kappa_y^2 + EIz kappa_z^2).
 
-    The force is its exact gradient -dV/dx along displacements (r + x, R exp(x)): from material angular velocities,
+    The force is its exact gradient -dV/dx along displacements (r + x, R exp(x)); it uses the rates for material angular
+    velocities,
 
         psidot = T(psi)^-1 Om_2 - T(psi)^-T Om_1,    Om_m = (Om_1 + Om_2)/2 + tan(|psi|/4)/(2 |psi|) psi x (Om_2 - Om_1)
 
-    A rigid motion turns the force, and changes no strain. Damping adds `damping` times their rates to the strains.
-    Displacements converge with order 2 in L. Neighbouring nodes may not be turned by pi or more from one another.
+    A rigid motion rotates the force, and changes no strain. With damping, strains are replaced by strains plus
+    `damping` times their rates. Displacements converge with order 2 in L. The relative rotation of neighbouring nodes
+    must be below pi.
 
     Args:
         q: {"r": (2, 3) in m, "R": (2, 3, 3)} of two nodes.
         v: {"r": (2, 3) in m/s, "R": (2, 3) in rad/s}, the latter material angular velocities.
         t, params: not used.
-        each: "L", m, the length at rest; "EA", "GAy" and "GAz", N, the latter two with the shear factors in them;
-            "GJ", "EIy" and "EIz", N m^2: EIy for bending about y, in the plane of x and z.
-            If need be, "damping", s: of the material; "frame", (3, 3): a rotation, whose columns are the axes of the
-            beam in the frames of its nodes; "rest", (6,): the strains at rest, of `spatial_strain`.
+        each: "L", m, the undeformed length; "EA", "GAy" and "GAz", N, where the latter two include the shear factors;
+            "GJ", "EIy" and "EIz", N m^2: EIy for bending about y, in the plane of x and z. Optional: "damping", s: of
+            the material; "frame", (3, 3): a rotation, whose columns are the axes of the beam in the frames of its
+            nodes; "rest", (6,): the strains in the stress-free state, from `spatial_strain`.
 
     Returns: {"r": (2, 3) in N, "R": (2, 3) in N m}, the latter moments in material components.
     Raises: TypeError, ValueError: leaves or numbers that are missing, misspelt, or of another shape.
@@ -70,12 +73,12 @@ def spatial_beam(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -
 
 
 def spatial_strain(q: PyTree, each: PyTree) -> jax.Array:
-    """(Gamma, kappa) of a `spatial_beam`: stretch and shears, without unit, twist and curvatures, 1/m.
+    """(Gamma, kappa) of a `spatial_beam`: stretch and shears, dimensionless, twist and curvatures, 1/m.
 
-    Times the stiffnesses, they are the forces and moments in the section, in the beam's frame. Those of the undeformed
-    nodes, put into `each` as "rest", make a beam that is curved or twisted at rest.
+    Multiplied by the stiffnesses, they are the forces and moments in the cross-section, in the beam's frame. For a beam
+    that is curved or twisted in its stress-free state, put its strains in that state into `each` as "rest".
 
-    Args: q, each: as in `spatial_beam`; without stiffnesses, too.
+    Args: q, each: as in `spatial_beam`; stiffnesses are not needed.
     Returns: (6,).
     Raises: TypeError, ValueError: as `spatial_beam`.
 
@@ -88,17 +91,17 @@ def spatial_strain(q: PyTree, each: PyTree) -> jax.Array:
 
 
 def spatial_mass(q: PyTree, w: PyTree, params: PyTree, each: PyTree) -> dict:
-    """M w of a `spatial_beam`: consistent with linear places, with half of the moments of inertia at either node.
+    """M w of a `spatial_beam`: consistent with linear positions; each node gets half of the moments of inertia.
 
         M = rhoA L/6 [[2, 1], [1, 2]] on r,    J = L/2 diag(rhoIy + rhoIz, rhoIy, rhoIz) on each Om, in the beam's frame
 
-    Exact for rigid motions. M is constant, and all that turning adds is `gyroscopic` of the nodes, with this J.
+    Exact for rigid motions. M is constant; the only further inertia force is `gyroscopic` at the nodes, with this J.
 
     Args:
         q, w: of two nodes, {"r": (2, 3) in m, "R": (2, 3, 3)}; accelerations {"r": (2, 3), "R": (2, 3)}.
         params: not used.
-        each: "L", m; "rhoA", kg/m; "rhoIy" and "rhoIz", kg m: the moments of inertia of the section per length.
-            If need be, "frame", as in `spatial_beam`.
+        each: "L", m; "rhoA", kg/m; "rhoIy" and "rhoIz", kg m: the moments of inertia of the cross-section per length.
+            Optional: "frame", as in `spatial_beam`.
 
     Returns: {"r": (2, 3) in N, "R": (2, 3) in N m}.
     Raises: TypeError, ValueError: as `spatial_beam`.
@@ -119,15 +122,15 @@ def spatial_mass(q: PyTree, w: PyTree, params: PyTree, each: PyTree) -> dict:
 
 
 def spatial_lumped_mass(nodes: Array, each: PyTree, num_nodes: int) -> dict:
-    """The diagonal mass of beams in space, for all of them at once: half of each goes to either node.
+    """The diagonal mass of all beams in space together: half of each beam goes to either node.
 
-    "R" of it is "J" of `gyroscopic`, with one node an element.
+    Its "R" is the "J" of `gyroscopic`, for elements with one node.
 
     Args:
         nodes: (E, 2), integers: the nodes of each beam.
         each: "L", m; "rhoA", kg/m; "rhoIy" and "rhoIz", kg m; each a number or (E,). With a "frame" the mass would not
-            be diagonal: take `spatial_mass`.
-        num_nodes: N, of the whole system.
+            be diagonal: use `spatial_mass`.
+        num_nodes: N, the number of nodes of the system.
 
     Returns: {"r": (N, 3) in kg, "R": (N, 3) in kg m^2}.
     Raises: ValueError: numbers that are missing or misspelt, or a frame.
@@ -150,8 +153,8 @@ def _frame(caller: str, each: PyTree, like: Array):
 
 
 def _kinematics(caller: str, q: PyTree, each: PyTree, stiffness: tuple):
-    """The strains (6,), their rates as a function of v, and the force on the nodes as one of what works on the strains:
-    -L times the transpose of the rates."""
+    """The strains (6,); their rates as a function of v; and the force on the nodes as a function of the stresses, which
+    is -L times the transpose of the rates."""
     require_nodes(caller, q, r=(2, 3), R=(2, 3, 3))
     require_each(caller, each, "L", *stiffness)
     r, (R1, R2) = q["r"], q["R"]

@@ -1,4 +1,4 @@
-"""What pulls and turns along one direction: bars, springs with dampers, springs that twist."""
+"""Forces along one direction or about one axis: bars, springs with dampers, torsion springs."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from hhtjax.numerics.dense_lu import matvec
 
 
 def truss(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> dict:
-    """The force EA (l - L)/L of a bar along its line, with its length l = |r_2 - r_1|.
+    """The force EA (l - L)/L of a bar along its line; its length is l = |r_2 - r_1|.
 
     Args:
         q: {"r": (2, d) in m} of two nodes, d = 2 or 3. v, t, params: not used.
-        each: "L", m, the length at rest; "EA", N.
+        each: "L", m, the undeformed length; "EA", N.
 
-    Returns: {"r": (2, d) in N}: what acts on the nodes; 0 where l = 0, which has no direction.
+    Returns: {"r": (2, d) in N}: the force on the nodes; 0 if l = 0, where the line has no direction.
     Raises: TypeError, ValueError: leaves or numbers that are missing, misspelt, or of another shape.
 
     >>> q = {"r": jnp.array([[0.0, 0.0], [0.0, 1.1]])}
@@ -31,13 +31,13 @@ def truss(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> dict:
 
 
 def spring_damper(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> dict:
-    """The force k (l - L) + c dl/dt of a spring and a damper along their line, with its length l = |r_2 - r_1|.
+    """The force k (l - L) + c dl/dt of a spring and a damper along their line; its length is l = |r_2 - r_1|.
 
     Args:
         q, v: {"r": (2, d) in m} of two nodes, d = 2 or 3; their rates. t, params: not used.
-        each: "L", m, the length at rest, which may be 0; "k", N/m; "c", N s/m, if need be.
+        each: "L", m, the undeformed length, which may be 0; "k", N/m; optional "c", N s/m.
 
-    Returns: {"r": (2, d) in N}: what acts on the nodes; 0 where l = 0, which has no direction.
+    Returns: {"r": (2, d) in N}: the force on the nodes; 0 if l = 0, where the line has no direction.
     Raises: TypeError, ValueError: as `truss`.
 
     >>> q, v = {"r": jnp.array([[0.0, 0.0], [0.0, 1.1]])}, {"r": jnp.array([[0.0, 0.0], [3.0, 2.0]])}
@@ -55,17 +55,17 @@ def spring_damper(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) 
 
 
 def torsion_spring(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree) -> dict:
-    """The moment k phi + c dphi/dt of a spring and a damper that keep two bodies in one direction.
+    """The moment k phi + c dphi/dt of a torsion spring and damper between two bodies.
 
-    In the plane phi = theta_2 - theta_1 - angle. In space phi = log(R_1^T R_2), the rotation vector, and the rate is
-    that of body 2 beside body 1; |phi| < pi.
+    In the plane phi = theta_2 - theta_1 - angle. In space phi = log(R_1^T R_2), the rotation vector; dphi/dt stands for
+    the angular velocity of body 2 relative to body 1; |phi| < pi.
 
     Args:
         q, v: {"theta": (2,)} or {"R": (2, 3, 3)} of two nodes; {"theta": (2,)} or {"R": (2, 3)}, rad/s.
         t, params: not used.
-        each: "k", N m/rad; "c", N m s/rad, and in the plane "angle", rad, that at rest, if need be.
+        each: "k", N m/rad; optional "c", N m s/rad, and in the plane "angle", rad, the angle at which it is relaxed.
 
-    Returns: {"theta": (2,)} or {"R": (2, 3)}, N m: what acts on the nodes, in material components.
+    Returns: {"theta": (2,)} or {"R": (2, 3)}, N m: the moment on the nodes, in material components.
     Raises: TypeError, ValueError: leaves or numbers that are missing, misspelt, or of another shape.
 
     >>> print(torsion_spring({"theta": jnp.array([0.0, 0.5])}, {}, 0.0, {}, {"k": 2.0, "angle": 0.1})["theta"])
@@ -93,7 +93,7 @@ def torsion_spring(q: PyTree, v: PyTree, t: Array, params: PyTree, each: PyTree)
 
 
 def _line(caller: str, q: PyTree, each: PyTree, *needed: str):
-    """The length, and the unit vector from node 1 to node 2, with derivatives that are numbers at length 0, too."""
+    """The length, and the unit vector from node 1 to node 2; derivatives are finite at length 0, too."""
     require_nodes(caller, q, r=(2, shape_of(q, "r")[-1]))
     require_each(caller, each, *needed)
     d = q["r"][1] - q["r"][0]

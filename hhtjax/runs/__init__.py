@@ -1,12 +1,12 @@
-"""Runs: one, many at once, over the disk, between their samples; and what they say about themselves.
+"""Runs: one run, many runs at once, runs saved to disk, values between samples; and their failures.
 
     simulate          one run: a `Solution`, whose `check()` names the first step that failed
-    sweep             many runs at once, with step sizes, parameters, starts and coefficients of their own
-    sweep_to_disk     the same in pieces, which survive being killed, by this process or by workers
-    parallel_map      any function of many members, by the workers of an executor; `map_to_disk` keeps what is done
-    adaptive          a tolerance in the place of the step size; `choose_steps` gives the steps alone
-    Event, impact     what happens where a guard falls to zero: impacts, stops, switches, the end
-    interpolate       what lies between the saved times
+    sweep             many runs at once, each with its own step size, parameters, start and coefficients
+    sweep_to_disk     a sweep in chunks, by this process or by workers; it can be killed and continued
+    parallel_map      any function of many members, by the workers of an executor; `map_to_disk` saves the results
+    adaptive          tolerances instead of a step size; `choose_steps` returns the steps alone
+    Event, impact     changes when a guard falls to zero: impacts, stops, switches, the end of the run
+    interpolate       values between the saved times
 
 Everything composes with `jit`, `vmap` and `grad`: dt, alpha, q0, v0 and params can all be differentiated.
 
@@ -21,12 +21,12 @@ Everything composes with `jit`, `vmap` and `grad`: dt, alpha, q0, v0 and params 
 >>> jax.vmap(final_angle, in_axes=(0, None, None))(jnp.logspace(-4, -1, 7), -0.05, 0.5).shape     # many steps at once
 (7,)
 
-Known by what they read
------------------------
+When a program is compiled anew
+-------------------------------
 
-A system, or the residuals of a fit, is compiled at the first call, and then known by its functions and by all that they
-read from outside: globals, variables around them, lists, objects, arrays. What has changed is seen in the next call,
-which compiles anew:
+A system, or the residuals of a fit, is compiled at the first call. Later calls reuse the program if the functions, and
+everything that they read from outside, are the same: globals, closure variables, lists, objects, arrays. If any of
+these has changed, the next call compiles anew:
 
 >>> stiffness = 1.0
 >>> def force(q, v, t, params):
@@ -39,42 +39,43 @@ which compiles anew:
 >>> end() < before
 True
 
-So what changes often belongs into params: that costs no compilation, and has derivatives. `fit` says what it does with
-data; `simulate`, what holds inside a jit of yours.
+So put what changes often into params: this costs no compilation, and has derivatives. `fit` says what it does with
+data, and `simulate` what happens inside your own jit.
 
 The first call
 --------------
 
-takes seconds: the functions are traced, and XLA compiles what becomes of them, where a jit of yours is around it in up
-to twice the time that it takes elsewhere, unless that asks for the same: `jax.jit(f,
-compiler_options=hhtjax.xla.QUICK)`, for systems of up to 32 unknowns on the CPU. Compiled programs can be kept on disk.
-A second process then has only to trace, in a quarter to two thirds of the time. Before the first call:
+The first call takes seconds, because the functions are traced and XLA compiles the result. Inside your own `jax.jit`
+compilation can take twice as long. Pass the options that the library uses itself,
+`jax.jit(f, compiler_options=hhtjax.xla.QUICK)`, for systems of up to 32 unknowns on the CPU. Compiled programs can be
+kept on disk. A second process then only has to trace, which takes a quarter to two thirds of the time. Before the first
+call:
 
     hhtjax.keep_programs("~/.cache/hhtjax")
 
-While a first call takes longer than two seconds, one line on stderr says so, by the logger `hhtjax` of Python's
-`logging`; `logging.getLogger("hhtjax").setLevel("ERROR")` keeps it quiet.
+A first call that takes longer than two seconds writes one line to stderr, by the logger `hhtjax` of Python's `logging`.
+`logging.getLogger("hhtjax").setLevel("ERROR")` silences it.
 
-After the imports, `import gc; gc.freeze()` spares the garbage collector all that they have made, which it else looks
-through again and again while functions are traced: 5 to 20 % of a first call. The library leaves the collector alone.
+After the imports, call `import gc; gc.freeze()` to save 5 to 20 % of a first call: the garbage collector then does not
+inspect all imported objects again and again during tracing. The library does not change the collector.
 
 Later calls
 -----------
 
-take some 0.2 ms of Python where `simulate` is called as it is: its arguments are checked, and what its functions read
-is looked at. In a jit of yours they do not: a run of fifty steps then takes a tenth more than its steps in a loop of
-their own where q alone is returned, and each further array of the `Solution` takes about a microsecond. Arrays among
-params are handed over faster than numbers of Python, and several faster than one vector that is taken apart inside. JAX
-hands programs of more than a thousand operations to another thread, which takes 10 us;
-`jax.config.update("jax_cpu_enable_async_dispatch", False)`, before anything else, does without. Measured on a page,
-`experiments/benchmarks/README.md`.
+A later call of `simulate` takes some 0.2 ms of Python, to check its arguments and what its functions read. In your own
+jit this time disappears. A run of fifty steps of which only q is returned then takes a tenth longer than a loop over
+its steps alone; each further array of the `Solution` takes about a microsecond. Arrays in params are passed faster than
+Python numbers, and several arrays faster than one vector that is split inside. JAX passes programs of more than a
+thousand operations to another thread, which takes 10 us; `jax.config.update("jax_cpu_enable_async_dispatch", False)`,
+before anything else, avoids this. The page `experiments/benchmarks/README.md` has the measurements.
 
 A controller that samples
 -------------------------
 
-It reads the state every so often, and holds its force in between. That is a scan over short runs, one for each period,
-each from the end of the one before, with the force in params. What the controller remembers (an integral, the last
-force, for a limit on its rate) goes along in the carry. This one takes a mass to zero, and to rest, in two periods:
+A sampling controller reads the state at the start of each period and holds its force during the period. Write it as a
+scan over short runs, one for each period. Each run starts from the end of the previous one, with the force in params.
+The memory of the controller (an integral, or the last force to limit its rate) goes into the carry. This controller
+brings a mass to rest at zero in two periods:
 
 >>> def controlled(params, period=0.1):
 ...     def run_for_a_period(carry, t0):
@@ -89,18 +90,18 @@ force, for a limit on its rate) goes along in the carry. This one takes a mass t
 >>> runs.q.shape, [round(abs(float(q)), 6) for q in runs.q[:, -1, 0]]    # start and steps of each; its end
 ((4, 6, 1), [0.5, 0.0, 0.0, 0.0])
 
-Each run begins anew, where the force jumps, so that the method keeps its order; derivatives pass through all, and each
-is one kernel: 1500 periods of a crane, of five steps each, take half the time of the same on plain JAX, where their
-ends alone are kept (`save_every=5`), and .7 of it where all steps are. The matrices of a `LinearSystem` are factorised
-once, before the scan. Each start takes some 12 solves more; `hht(start="simple")` does without, where nothing is stiff.
-Internal states go on from `run.z[-1]`. What is held, but known before, is `sampled(order=0)`.
+Each run starts anew where the force jumps, so the method keeps its order. Derivatives pass through all runs, and each
+run is one kernel. 1500 periods of a crane with five steps each take half the time of plain JAX if only their ends are
+saved (`save_every=5`), and .7 of it if all steps are. The matrices of a `LinearSystem` are factorised once, before the
+scan. Each start takes some 12 additional solves; `hht(start="simple")` avoids them if nothing is stiff. Continue
+internal states from `run.z[-1]`. For a held input that is known in advance use `sampled(order=0)`.
 
 Sweeps
 ------
 
-Step sizes, parameters, initial states and coefficients are data: any list of step sizes is one compiled call, sampled
-at common times, at about the work of its members' own steps. A member that fails is flagged, and leaves the others
-alone.
+Step sizes, parameters, initial states and coefficients are data. Any list of step sizes is one compiled call, sampled
+at common times. Its work is about the sum of the steps of its members. A member that fails is flagged and does not
+affect the others.
 
 >>> dts = jnp.logspace(-3, -1, 9)                    # made smaller, if need be, to land on the samples: sweep.dt
 >>> sweep = hhtjax.sweep(pendulum, hhtjax.hht(), q0, v0, params, dts=dts, duration=2.0, num_samples=20)
@@ -108,10 +109,11 @@ alone.
 >>> sweep.q.shape
 (9, 21, 1)
 
-`times=`, in the place of `duration` and `num_samples`, are sample times at any distances, as of measured data; steps
-end at each. `in_axes=`, as for `jax.vmap`, says what else differs between members. `sweep_to_disk` writes chunks of
-members as `.npz`, or as one Zarr store, continues where it was killed, and refuses other inputs. With `executor=` the
-workers of a cluster run the chunks, whatever they are started by, as `parallel_map` has them run functions of yours.
+`times=` replaces `duration` and `num_samples` by sample times at any distances, such as those of measured data; steps
+end at each of them. `in_axes=`, as for `jax.vmap`, says what else differs between members. `sweep_to_disk` writes
+chunks of members as `.npz` files or as one Zarr store. It continues after it was killed, and raises an error if the
+inputs have changed. With `executor=` the workers of a cluster run the chunks, however they were started. `parallel_map`
+lets them run your own functions in the same way.
 
 >>> from concurrent.futures import ThreadPoolExecutor                 # or Dask's client.get_executor(), MPIPoolExecutor
 >>> with ThreadPoolExecutor(2) as executor:
@@ -119,36 +121,37 @@ workers of a cluster run the chunks, whatever they are started by, as `parallel_
 >>> ends.shape
 (9,)
 
-Where all devices are there from the start, in every process:
+If all devices are available from the start, run this in every process:
 
     jax.distributed.initialize()
     mesh = jax.make_mesh((jax.device_count(),), ("members",))
     sweep = hhtjax.sweep(pendulum, hhtjax.hht(), q0, v0, params, dts=dts, duration=2.0, num_samples=20, mesh=mesh)
 
-The results are those of one device, to rounding: devices get blocks of members of their own, which XLA may compile
-otherwise. What this costs, with large systems (`hht(solve=hhtjax.banded(p))`, or
-`conjugate_gradients(k)`, whose steps grow with the number of unknowns) and a step at 1 kHz, is on a page,
-`experiments/sweeps/README.md`.
+The results agree with those of one device to rounding: each device gets its own blocks of members, which XLA may
+compile differently. The page `experiments/sweeps/README.md` has the times of this, of large systems
+(`hht(solve=hhtjax.banded(p))`, or `conjugate_gradients(k)`, whose step time is proportional to the number of unknowns),
+and of a step at 1 kHz.
 
 Dense output
 ------------
 
-`interpolate` gives q, v and internal states at any times inside a run. Derivatives pass through it, so that a fit may
-compare at the times of the measurements.
+`interpolate` returns q, v and internal states at any times inside a run. It is differentiable, so a fit can compare
+with measurements at their own times.
 
 >>> run = hhtjax.simulate(pendulum, hhtjax.hht(), q0, v0, params, dt=1e-2, num_steps=600)
 >>> hhtjax.interpolate(run, jnp.array([0.123, 4.56])).q.shape
 (2, 1)
 
-It gives accelerations, multipliers and dry friction, too. `simulate(..., times=)` reads a run off at such times while
-it goes, and keeps nothing else.
+It returns accelerations, multipliers and dry friction, too. `simulate(..., times=)` interpolates at such times during
+the run, and keeps nothing else.
 
 Outputs
 -------
 
-`output=` saves a function of the motion in the place of q and v, in `simulate`, `sweep` and `sweep_to_disk`: what
-sensors show, energies, a distance. It names what it reads, of q, v, w (the acceleration), L (multipliers), z, zdot,
-friction, sticking, contact, t and params. A run of a million steps of a large system then keeps what is asked for.
+With `output=`, `simulate`, `sweep` and `sweep_to_disk` save a function of the motion instead of q and v: sensor
+signals, energies, a distance. Its argument names say what it reads, of q, v, w (the acceleration), L (multipliers), z,
+zdot, friction, sticking, contact, t and params. A run of a million steps of a large system then keeps only what you ask
+for.
 
 >>> def felt(q, w, params):
 ...     return {"height": -params["l"] * jnp.cos(q[0]), "turning": w[0]}
@@ -157,26 +160,27 @@ friction, sticking, contact, t and params. A run of a million steps of a large s
 >>> run.q, run.output["height"].shape
 (None, (3,))
 
-`hhtjax.measure` shows such an output of a run that has kept q and v, as a sensor with a delay, an offset and a clock of
-its own, and `hhtjax.accelerometer` is an output.
+`hhtjax.measure` applies such an output to a run that has saved q and v, as a sensor with its own delay, offset and
+clock. `hhtjax.accelerometer` is such an output.
 
 Tolerances
 ----------
 
-`dt=adaptive(rtol, atol)` chooses steps by their errors, in one loop that keeps the samples too. For derivatives, and in
-a batch, a run over these steps follows: it is differentiable, and the steps constant. `run.steps` tells how many were
-accepted and rejected, `check()` names the time at which there were no more. It pays where a motion has parts of very
-different speed, as contacts and relaxation; conservative motions of one time scale want equal steps, whose errors
-cancel over a period.
+`dt=adaptive(rtol, atol)` chooses steps by their errors, in one loop that also keeps the samples. For derivatives, and
+in a batch, a second run with these steps follows, which is differentiable and treats the steps as constants.
+`run.steps` holds the numbers of accepted and rejected steps. `check()` names the time at which steps ended too early.
+Use it for motions with phases of very different speed, such as contacts and relaxation. For conservative motions with
+one time scale prefer equal steps, whose errors cancel over a period.
 
 >>> run = hhtjax.simulate(pendulum, hhtjax.hht(), q0, v0, params, dt=hhtjax.adaptive(1e-3, 1e-6), times=[0.123, 4.56])
 >>> run.check()
 >>> run.q.shape
 (3, 1)
 
-An estimate of one step says nothing of what the motion makes of an error later. `verify=True` states the error of the
-whole run, `run.error`, at each sample, and `check()` fails above ten times the tolerance. `verify="tighten"` chooses
-steps anew, for smaller tolerances, until the error of the run is what was asked for; without it, here, 20 times that.
+An error estimate for one step does not show how the motion amplifies the error later. `verify=True` reports the error
+of the whole run, `run.error`, at each sample, and `check()` fails above ten times the tolerance. `verify="tighten"`
+chooses steps again, for smaller tolerances, until the error of the run is below the tolerance. Without it the error in
+this example is 20 times the tolerance.
 
 >>> planet = hhtjax.System(jnp.ones(2), lambda q, v, t, p: -q / jnp.sum(q**2) ** 1.5)
 >>> start, year = (jnp.array([0.5, 0.0]), jnp.array([0.0, 3**0.5])), jnp.linspace(0, 2 * jnp.pi, 13)[1:]
@@ -187,7 +191,7 @@ steps anew, for smaller tolerances, until the error of the run is what was asked
 19.63
 0.76
 
-In a sweep each member has steps of its own, and tolerances may be data: error against tolerance is one call.
+In a sweep each member has its own steps, and tolerances may be data, so error against tolerance is one call.
 
 >>> rtol = jnp.array([1e-2, 1e-3, 1e-4])
 >>> sweep = hhtjax.sweep(
@@ -198,10 +202,11 @@ In a sweep each member has steps of its own, and tolerances may be data: error a
 Events
 ------
 
-`events=[Event(guard, reset=, switch=, terminal=)]`: impacts, end stops, backlash, switches, the end of the run. Where a
-guard falls to zero inside a step, the step is taken up to that time, the velocity or the params change, and the step is
-finished from there: the grid and the saved times stay, the method keeps its order, and derivatives are exact, that of
-the time among them. `run.events` tells what happened, when, and the velocities before and after.
+`events=[Event(guard, reset=, switch=, terminal=)]` describes impacts, end stops, backlash, switches and the end of the
+run. When a guard falls to zero inside a step, the step is taken up to that time, the velocity or the params change, and
+the rest of the step follows. The time grid and the saved times do not change, and the method keeps its order.
+Derivatives are exact, including that of the event time. `run.events` holds which events happened, when, and the
+velocities before and after.
 
 >>> ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, p: 0 * q - 9.81)
 >>> floor = hhtjax.Event(guard=lambda q, v, t, p: q[0] - p["floor"], reset=hhtjax.impact(restitution="e"))
@@ -216,8 +221,8 @@ the time among them. `run.events` tells what happened, when, and the velocities 
 >>> round(float(jax.grad(lambda e: bounce(e).q[-1, 0])(0.8)), 4)              # 4.4294 (0.6 - sqrt(2/9.81))
 0.6577
 
-Modes, numbers in params that `switch` changes, are how a force jumps: a stop with a damper, a clutch, a broken link.
-Here a spring that is only there beyond q = 1:
+A force that jumps is written with a mode, a number in params that `switch` changes: a stop with a damper, a clutch, a
+broken link. Here a spring acts only beyond q = 1:
 
 >>> stop = hhtjax.Event(
 ...     guard=lambda q, v, t, p: (1.0 - q[0]) * (1 - 2 * p["on"]), switch=lambda p: p | {"on": 1 - p["on"]})
@@ -228,8 +233,9 @@ Here a spring that is only there beyond q = 1:
 >>> int(run.events.count), round(float(run.events.after[1, 0]), 2)
 (2, -0.73)
 
-`switch(q, v, t, params)` sees the state, too. What happens at known times has no guard: `Event(at=times)`, with numbers
-or a function of params, divides steps there, and error control ends them there. Runs are differentiable in the times.
+`switch(q, v, t, params)` takes the state, too. For changes at known times use `Event(at=times)`, with numbers or a
+function of params, instead of a guard. It divides steps there, and with error control steps end there. Runs are
+differentiable in the times.
 
 >>> brake = hhtjax.Event(at=lambda p: p["time"], switch=lambda p: p | {"force": -0.8})
 >>> cart = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, p: p["force"] + 0 * q)
@@ -241,27 +247,28 @@ or a function of params, divides steps there, and error control ends them there.
 >>> [round(float(f(0.27)), 6) for f in (where, jax.grad(where))]              # 1 - .4 (1 - .27)^2, .8 (1 - .27)
 [0.78684, 0.584]
 
-Contact that lasts is a `Contact` of the system (`hhtjax.systems`). In three dimensions, without friction, it can be a
-constraint that events switch on and off: on where the body meets its stop, with `impact(0.0)`, off where the multiplier
-falls to zero, which a guard sees that has an argument `multipliers`. The number of constraints of a run is fixed, so
-one that is off holds a coordinate of its own instead: `hhtjax.scenes.shaken_table` shows it. A body may start at rest
-at its guard where its acceleration takes it off.
+For lasting contact use a `Contact` of the system (`hhtjax.systems`). In three dimensions, without friction, use a
+constraint that events switch on and off: on where the body reaches its stop, with `impact(0.0)`, and off where the
+multiplier falls to zero, by a guard with an argument `multipliers`. The number of constraints of a run is fixed, so a
+constraint that is off holds a coordinate of its own instead; see `hhtjax.scenes.shaken_table`. A body may start at rest
+at its guard if its acceleration lifts it off.
 
-What fails is named, and never ends behind the wall: more changes in a step than `max_events`, as of a ball that comes
-to rest; a motion that stays beyond its guard; two impacts at one time; a start beyond a guard. Derivatives belong to
-the order in which events happen; where a motion only grazes a guard they grow without bound (`run.events.rate` tells),
-and a guard that falls and rises again within a step is seen where the cubic through its ends sees it.
+Failures are reported, and a run never ends beyond a guard: more changes in one step than `max_events`, as for a ball
+that comes to rest; a guard that stays negative; two impacts at the same time; a start beyond a guard. Derivatives hold
+for a fixed order of events. If a motion only grazes a guard they grow without bound (see `run.events.rate`). A guard
+that falls below zero and rises again within a step is detected if the cubic through its values and rates at both ends
+falls below zero.
 
 Events work with mass matrices, constraints (the impulse obeys them), rotations, internal states, dry friction, held
-inputs, uneven steps, `interpolate`, `sweep`, `fit`, `extrapolate` (of which the order is 3 then), and with error
-control, where samples lie on the motion before or behind an event, and steps that meet more events than one are made
-shorter. In a batch of one's own they cost what they cost in `sweep`: the batch looks for events where a member has one.
-In `vmap` of a reverse derivative they cost more. Figures, orders, derivatives and an impact oscillator are on a page,
-`experiments/events/README.md`.
+inputs, uneven steps, `interpolate`, `sweep`, `fit`, `extrapolate` (which then has order 3), and error control. With
+error control, samples lie on the motion before or after an event, and steps with more than one event are shortened. In
+your own `jax.vmap` they cost what they cost in `sweep`: the batch does the work of an event only in steps in which a
+member has one. In `vmap` of a reverse derivative they cost more. The page `experiments/events/README.md` has figures,
+orders, derivatives and an impact oscillator.
 
 Extrapolation
 -------------
 
-`simulate(..., extrapolate=2)`, or 3, takes the leading errors in dt out of two, or three, runs with steps of dt, dt/2
-(and dt/4): order 3 and 4 where the motion is smooth and dt resolves it, 3 with switches of dry friction.
+`simulate(..., extrapolate=2)` or 3 combines two or three runs, with steps dt, dt/2 (and dt/4), to remove the leading
+errors in dt. The order is 3 and 4 where the motion is smooth and dt resolves it, and 3 with switches of dry friction.
 """

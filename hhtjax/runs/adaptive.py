@@ -1,4 +1,4 @@
-"""A tolerance in the place of a step size: what a user asks for, and its checks."""
+"""`adaptive`: the tolerances of error control, and their checks."""
 
 from __future__ import annotations
 
@@ -45,38 +45,44 @@ def adaptive(
     max_steps: int = 10_000,
     verify: bool | str = False,
 ) -> Adaptive:
-    """Steps chosen by the error of each, for `simulate(..., dt=adaptive(...), times=...)`.
+    """Tolerances from which step sizes are chosen, for `simulate(..., dt=adaptive(...), times=...)`.
 
-    The estimated error of each step in q_i stays below (atol + rtol max|q_i|) rtol^(1/2), that in v_i alike, with the
-    largest values so far; rtol^(1/2) because errors of steps add up, and only for the `hht` family. So errors of the
-    run follow rtol, but nothing is promised: an error that grows, the phase of an undamped vibration or chaos, is seen
-    by no estimate of one step, and what happens and is over within a step neither (give dt_max). `verify` sees the
-    first, and "tighten" mends it: on a planet's orbit an error of the energy is one of the period, and adds up; a
-    revolution (e = 0.5) ends 13 to 40 tolerances off with methods of order 2, up to 12 with `rowda`, 4 with `dopri5`,
-    and within one with "tighten". Steps end where held inputs, `sampled(order=0)`, jump. With dry friction the error is
-    that of the motion on either side of a switch: the jump of the acceleration is no reason to reject.
+    The estimated error of each step stays below (atol + rtol max|q_i|) rtol^(1/2) in q_i, and likewise in v_i, where
+    the maximum is over the motion so far. The factor rtol^(1/2) allows for the sum of step errors; only the `hht`
+    family has it. So the error of the run scales with rtol, but it is not guaranteed to stay below it. An estimate for
+    one step cannot see errors that grow later: the phase of an undamped vibration, or chaos. Nor can it see an event
+    shorter than the step (give dt_max).
 
-    With `events` steps pass them as steps of given sizes do, and what is left of a step behind an event has an error of
-    its own. Where there is none, as in free flight, steps grow without bound, and a guard that falls and rises again
-    within one of them may be missed: give dt_max.
+    `verify` measures the error of the whole run, and verify="tighten" reduces it to the tolerance. On a planet's orbit,
+    for example, an energy error changes the period, so the position error grows with every revolution. After one
+    revolution (e = 0.5) the error is 13 to 40 tolerances with methods of order 2, up to 12 with `rowda`, 4 with
+    `dopri5`, and below one with "tighten". Steps end where held inputs, `sampled(order=0)`, jump. With dry friction the
+    error is that of the motion on either side of a switch: the jump of the acceleration does not reject a step.
 
-    In `sweep(..., dts=adaptive(...))` each of the numbers may be an array (B,), one for each member.
+    With `events`, steps pass them as steps of given sizes do, and the remainder of a step after an event has its own
+    error estimate. Where there is no error, as in free flight, steps grow without bound. A guard that falls below zero
+    and rises again within one step may then be missed: give dt_max.
+
+    In `sweep(..., dts=adaptive(...))` each number may be an array (B,), one value for each member.
 
     Args:
-        rtol: relative to the largest |q_i|, and |v_i|, so far; positive. Below 1e-4 float32 has nothing but rounding.
-        atol: in the unit of q (radians for rotations, and the unit of internal states and of y), positive. At rest it
-            alone rules.
-        atol_v: in that of v; by default atol per unit of time.
-        dt_min, dt_max: bounds of the step; a step below dt_min is a failure that `check()` names. Never below 16
-            roundings of t.
-        max_steps: steps at most, the rejected included. SubStep of the program; all else is data. Memory for so many is
-            filled in each call: no more than are needed, for 100,000 take some 10 to 100 microseconds.
-        verify: True, run again with every step halved, and state `run.error`, the error of the whole run at each of
-            `times`, for three times the solves. `check()` then fails where it exceeds 10 (atol + rtol max|q|). Where
-            the motion jumps, as in relaxation oscillations, at times that move by more than a step, that is a false
-            alarm: "tolerance" runs again with steps for a quarter of the tolerance instead. "tighten" goes on from
-            there: steps for ever smaller tolerances, `run.steps.tightened` times those given, until the error of the
-            run, by the run before, is below the tolerance itself at each of `times`; `check()` fails if it never is.
+        rtol: relative to the largest |q_i|, and |v_i|, so far; positive. Below 1e-4, float32 resolves only rounding
+            errors.
+        atol: in the unit of q (radians for rotations; the unit of internal states and of y), positive. It is the only
+            tolerance for a coordinate at rest.
+        atol_v: in the unit of v; default: atol per unit of time.
+        dt_min, dt_max: bounds of the step. A step below dt_min is a failure that `check()` reports. Steps never get
+            shorter than 16 roundings of t.
+        max_steps: largest number of steps, including rejected ones. It is part of the program; all other arguments are
+            data. Each call fills memory for max_steps steps, which takes 10 to 100 microseconds for 100,000. Ask for no
+            more than you need.
+        verify: True: run again with every step halved, and report `run.error`, the error of the whole run at each of
+            `times`, for three times the solves. `check()` then fails where it exceeds 10 (atol + rtol max|q|). This is
+            a false alarm if the motion jumps, as in relaxation oscillations, at times that differ by more than a step
+            between the runs; "tolerance" instead runs again with a quarter of the tolerance. "tighten" continues from
+            there, with ever smaller tolerances, `run.steps.tightened` times the given ones, until the error of the run,
+            compared with the previous run, is below the tolerance itself at each of `times`. `check()` fails if this is
+            never reached.
 
     Returns:
         An `Adaptive`.
@@ -108,7 +114,7 @@ def adaptive(
 
 
 def _require(name: str, value: Real, valid: Callable, expectation: str):
-    """An error unless a number, or each of several, (B,), is what is expected; it names the first that is not."""
+    """Raises an error unless a number, or each of several (B,), is valid; names the first that is not."""
     value = np.asarray(value) if isinstance(value, (list, tuple)) else value
     if not (is_real(value) and np.ndim(value) == 1 and np.size(value)):
         require_number("adaptive", name, value, valid, expectation)
@@ -122,22 +128,22 @@ def _as_data(x: Real) -> np.ndarray:
 
 
 def lengths(values: Sequence):
-    """Those of the arrays among numbers, each once."""
+    """The lengths of the arrays among `values`, each once."""
     return sorted({np.size(x) for x in values if np.ndim(x)})
 
 
 def require_single(caller: str, control: Adaptive):
-    """An error for the tolerances of several members."""
+    """Raises an error if tolerances are arrays, one for each member."""
     if lengths(jax.tree.leaves(control)):
         raise ValueError(f"{caller}: tolerances must be numbers; arrays (B,), one for each member, are for `sweep`.")
 
 
 def require_controlled(caller: str, stepper: Stepper, system: AnySystem):
-    """An error for a stepper without an estimate, or a system whose steps it does not judge."""
+    """Raises an error for a stepper without an error estimate, and for a system with contact."""
     if system.contact is not None:
         raise NotImplementedError(
-            f"{caller}: error control does not know `contact`, whose accelerations jump within steps: give `dt` as a "
-            "number, and halve it to see the error."
+            f"{caller}: error control does not support `contact`, whose accelerations jump within steps: give `dt` as "
+            "a number, and halve it to see the error."
         )
     if stepper.estimate_order is None:
         raise NotImplementedError(

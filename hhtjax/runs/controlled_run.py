@@ -1,4 +1,5 @@
-"""A run under error control: its steps chosen and its samples kept in one pass, or chosen and run; and its error."""
+"""A run under error control. Steps and samples are computed in one pass; or steps first, then the run. And its
+error."""
 
 from __future__ import annotations
 
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
 
 
 def run_controlled(problem, times: Real, control: Adaptive, progress: bool, events=None, room: tuple = ()) -> Solution:
-    """The run that `simulate` returns for an `Adaptive` in the place of dt."""
+    """The run of `simulate` with an `Adaptive` as dt."""
     times = checked_times("simulate", problem, times, control)
     if events is not None:
         events = require_events("simulate", problem, events, usual_step(problem.t0, times))
@@ -70,17 +71,17 @@ def run_controlled(problem, times: Real, control: Adaptive, progress: bool, even
 
 
 def passes_alone(problem: Problem, events) -> bool:
-    """Whether the steps and the samples are found in one pass, where nothing is made of the run."""
+    """Whether steps and samples are computed in one pass, which is so if the run is not differentiated or batched."""
     return events is None and problem.system.friction is None
 
 
 def unverified(control: Adaptive) -> Adaptive:
-    """The same steps."""
+    """A second run with the same steps."""
     return replace(control, verify=False)
 
 
 def finer(start: tuple, choice: tuple, steps: Steps, ends: Array, room: tuple, in_one: bool) -> Solution:
-    """The run with every step halved, or with steps chosen anew for a quarter of the tolerance."""
+    """The run with every step halved, or with steps chosen for a quarter of the tolerance."""
     if start[2].verify != "tolerance":
         return over(start, steps, ends, room, halved=True)
     problem, times, looser, theirs = choice
@@ -90,21 +91,21 @@ def finer(start: tuple, choice: tuple, steps: Steps, ends: Array, room: tuple, i
 
 
 def run_in_two(start: tuple, choice: tuple, progress: bool = False, room: tuple = ()):
-    """The `Solution` of a start, (problem, times, control, events), over the steps for a choice, another; its `Steps`,
-    and the times at which they end."""
+    """The `Solution` of a start, (problem, times, control, events), with steps chosen for another start, `choice`; its
+    `Steps`, and the times at which they end."""
     steps, ends = steps_for(choice, progress, room)
     return over(start, steps, ends, room), steps, ends
 
 
 def over(start: tuple, steps: Steps, ends: Array, room: tuple = (), halved: bool = False) -> Solution:
-    """The `Solution` over these steps, each halved or not."""
+    """The `Solution` with these steps, each halved or not."""
     problem, times, _, events = start
     keywords = {"halved": halved, "room": room, "rates": problem.rates()}
     return run_over(problem, times, ends, steps.accepted, events, **keywords)
 
 
 def run_tightened(start: tuple, alone: bool, progress: bool, room: tuple) -> Solution:
-    """The run with steps for as much of the tolerance as makes its error what was asked for."""
+    """The run whose tolerance is reduced until its error is as small as requested."""
     start, choice = (start, lax.stop_gradient(start)) if alone else run_and_choice(start)
     problem, times, control, events = choice
     choice = problem, times, unverified(control), events
@@ -122,7 +123,7 @@ def run_tightened(start: tuple, alone: bool, progress: bool, room: tuple) -> Sol
 
 @partial(Programs, static_argnames=("progress", "room"))
 def rounds(choice: tuple, progress: bool, room: tuple) -> Round:
-    """The last `Round`; no tracer of autodiff may come in."""
+    """The last `Round`. Arguments must not be tracers of autodiff."""
     problem, times, control, events = choice
 
     def once(share: Array):
@@ -137,7 +138,7 @@ def rounds(choice: tuple, progress: bool, room: tuple) -> Round:
 
 @partial(Programs, static_argnames=("progress",))
 def run_recorded(problem: Problem, times: Array, control: Adaptive, progress: bool = False):
-    """The same in one pass, but for what vmap makes of it; without derivatives."""
+    """The same in one pass, without derivatives; vmap changes it to two passes."""
 
     def record(problem: Problem, times: Array, control: Adaptive):
         steps, ends, run = select_steps(
@@ -165,7 +166,7 @@ def in_two_passes(problem: Problem, times: np.ndarray, control: Adaptive, progre
 
 
 def run_in_one(problem: Problem, times: Real, control: Adaptive, progress: bool = False):
-    """The same, with the derivatives of two passes, in a jit that may be one of a derivative or a batch."""
+    """One pass, with the derivatives of two passes, inside a jit that may be differentiated or batched."""
     data = problem, times, control
     in_one, in_two = (
         partial(run_recorded, progress=progress, rates=problem.rates()),
@@ -192,9 +193,9 @@ def chosen_steps(
     progress: bool = False,
     room: tuple = (),
 ):
-    """`Steps` to `end`, and the times at which they end; no tracer of autodiff may come in.
+    """`Steps` to `end`, and the times at which they end. Arguments must not be tracers of autodiff.
 
-    One kernel, what comes before and behind the loop too: each part that stands alone costs about a microsecond.
+    It is one kernel, including what comes before and after the loop: each separate part costs about a microsecond.
     """
 
     def found(problem: Problem, end: Array, control: Adaptive, events: tuple | None):
@@ -204,7 +205,8 @@ def chosen_steps(
 
 
 def steps_for(choice: tuple, progress: bool, room: tuple):
-    """The same to the last of the times, in one program for any number of these, and whatever becomes of the run."""
+    """The steps to the last of the times, by one program for any number of times, independent of what is done with the
+    run."""
     problem, times, control, events = choice
     control, problem = replace(control, verify=False), problem._replace(output=None)
     keywords = {"progress": progress, "room": room[:1], "rates": problem.rates()}
@@ -212,13 +214,13 @@ def steps_for(choice: tuple, progress: bool, room: tuple):
 
 
 def due(problem: Problem, times: Real) -> Real:
-    """The end of a run; or all of its times, for a stepper that lands on them."""
+    """The end of a run; or all of its times, for a stepper whose steps must end on them."""
     return times if problem.stepper.lands else times[-1]
 
 
 class Grid(NamedTuple):
-    """Frozen steps from t0 on. ends: (N,), inf behind the last; counts: (K,), how many there are from one of the times
-    to the next, the last of them ending at it or beyond; reached: the end of the last."""
+    """Frozen steps from t0 on. ends: (N,), inf after the last; counts: (K,), the number of steps from one of the times
+    to the next, where the last of them ends at that time or later; reached: the end of the last step."""
 
     t0: Real
     ends: Array
@@ -227,7 +229,7 @@ class Grid(NamedTuple):
 
     @classmethod
     def of(cls, t0: Array, times: Array, ends: Array, accepted: Real, halved: bool = False) -> Grid:
-        """Those with these ends, of which so many were accepted; each halved or not."""
+        """The steps with these ends, of which `accepted` are valid; each halved or not."""
         reached = jnp.where(accepted > 0, ends[jnp.maximum(accepted - 1, 0)], t0)
         wanted = jnp.minimum(times, reached)
         needed = jnp.searchsorted(ends, wanted)
@@ -243,7 +245,7 @@ class Grid(NamedTuple):
         return steps_of(flat, stepper, q, v, t0, params, self.sizes, resolves=True)
 
     def sizes(self, number: Real):
-        """Of a step its size, that of the one before, and where it ends; behind the last 1, and inf."""
+        """The size of a step, the size of the previous one, and the end of the step; after the last step 1, and inf."""
 
         def time(taken: Real) -> Array:
             end = lax.dynamic_index_in_dim(self.ends, jnp.maximum(taken - 1, 0), keepdims=False)
@@ -266,7 +268,8 @@ def run_over(
     halved: bool = False,
     room: tuple = (),
 ) -> Solution:
-    """The `Solution` at `times` over the steps with these ends, of which so many were accepted; each halved or not."""
+    """The `Solution` at `times` with the steps that have these ends, of which `accepted` are valid; each halved or
+    not."""
 
     def run(problem: Problem, times: Array, ends: Array, accepted: Array, events: tuple | None) -> Solution:
         t0, times = problem.times(problem.t0), problem.times(times)
@@ -278,12 +281,13 @@ def run_over(
 def follow(
     problem: Problem, times: Array, grid: Grid | EqualSteps, events: tuple | None = None, room: tuple = ()
 ) -> Solution:
-    """The `Solution` at `times` over the steps of a grid; in a batch it rests while others have more of them."""
+    """The `Solution` at `times` with the steps of a grid. In a batch, a member without steps left waits for the
+    others."""
     return drive(problem, grid.loop, partial(_between, times=times, grid=grid), events, room, between=True)
 
 
 def _between(run: Run, times: Array, grid: Grid | EqualSteps):
-    """Samples at these times, each read off in the step that ends there or beyond."""
+    """Samples at these times, each interpolated in the step that ends there or later."""
     problem, flat, params, loop, form = run
     in_pieces = loop.now is not None
     begun = partial(begun_with, flat, problem.stepper, params, loop)
@@ -318,10 +322,12 @@ def _between(run: Run, times: Array, grid: Grid | EqualSteps):
 def to_next_sample(
     loop: Loop, form, begun: Callable, keep: Callable | None, in_pieces: bool, read: Callable | None = None
 ):
-    """The body of the scan over the times: steps until one of them ends at the time or beyond, and both ends of that.
+    """The body of the scan over the times: it takes steps until one ends at the time or later, and returns both ends of
+    that step.
 
-    in_pieces: of the part of it between events, of which its `Pieces` tell; else the state before is carried along.
-    keep: what is kept of both, None for nothing; read: what else, of both, the run and the time.
+    in_pieces: both ends of the part between events, which its `Pieces` describe; else the previous state is carried
+    along. keep: what to keep of both ends, None for nothing; read: what else to compute from both ends, the run and the
+    time.
     """
     advance, begun = form.of(loop.advance), form.of(begun)
 
@@ -355,7 +361,7 @@ def output_in(
     run: tuple,
     time: Array,
 ) -> PyTree:
-    """The output of a run at a time between a pair of states, with their modes where there are events."""
+    """The output of a run at a time between two states, with their modes if there are events."""
     first, second, *modes = pair
     if modes:
         state, _, _, met = run
@@ -365,7 +371,7 @@ def output_in(
 
 
 def begun_with(flat: FlatSystem, stepper: Stepper, params: PyTree, loop: Loop, run: tuple) -> State:
-    """The state with which the next step of a run begins: behind a jump of held inputs."""
+    """The state from which the next step of a run starts, after a jump of held inputs if there is one."""
     state, count, _ = run
     h, last = loop.sizes(count)
     return step_start(stepper, flat, params, h, last, state)[1]
@@ -386,21 +392,22 @@ def choose_steps(
     max_events: int = 2,
     **tolerances: Any,
 ) -> Steps:
-    """The steps that error control takes: `simulate(..., dt=adaptive(...))` without the run.
+    """The steps that error control chooses: `simulate(..., dt=adaptive(...))` without the run.
 
-    The run over them, `simulate(..., dt=steps.dt)`, is differentiable, smooth in all its arguments, and frozen: it is
-    for the motion that the steps were chosen for, and others near by.
+    A run with these steps, `simulate(..., dt=steps.dt)`, is differentiable and smooth in all its arguments. The steps
+    are frozen: they fit the motion for which they were chosen, and motions close to it.
 
     Args:
         system, stepper, q0, v0, params, z0, t0, progress, events, max_events: those of `simulate`.
-        times: (K,); steps go to the last, and end at no other.
-        **tolerances: those of `adaptive`: rtol, atol, and others; not `verify`, which takes runs.
+        times: (K,); steps go to the last of them, and need not end at the others.
+        **tolerances: those of `adaptive`: rtol, atol, and others; not `verify`, which needs runs.
 
     Returns:
-        `Steps`, constant to derivatives. Nothing raises while they are chosen: call `steps.check()`.
+        `Steps`, constants for derivatives. Failures are not raised: call `steps.check()`.
 
     Raises:
-        TypeError, ValueError, NotImplementedError: those of `simulate` and `adaptive`; a stepper without an estimate.
+        TypeError, ValueError, NotImplementedError: those of `simulate` and `adaptive`; a stepper without an error
+            estimate.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> oscillator = hhtjax.LinearSystem(M=jnp.ones(1), C=jnp.full(1, 8.0), K=jnp.full(1, 16.0))
@@ -427,12 +434,12 @@ def choose_steps(
 
 
 def usual_step(t0: Real, times: np.ndarray) -> Real:
-    """How long a step may be before any is chosen: a thousandth of the run."""
+    """The limit of a step before any is chosen: a thousandth of the run."""
     return (times[-1] - t0) / 1000
 
 
 def checked_times(caller: str, problem: Problem, times: PyTree, control: Adaptive) -> Real:
-    """times, for a stepper that can be controlled."""
+    """Returns times, checked; raises an error for a stepper without error control."""
     require_controlled(caller, problem.stepper, problem.system)
     require_masses(caller, problem.system, "take steps without error control")
     require_single(caller, control)
@@ -452,8 +459,9 @@ ROUNDS = 8
 
 
 class Round(NamedTuple):
-    """run, steps, ends: what was found; share: of the tolerance that the steps were chosen for, and following: that of
-    the next round; error, allowed: those of the `Solution`; is_open: whether more is to be done; number: of rounds."""
+    """run, steps, ends: the results; share: the fraction of the tolerance for which the steps were chosen; following:
+    that of the next round; error, allowed: those of the `Solution`; is_open: whether another round is needed; number:
+    of rounds."""
 
     run: Solution
     steps: Steps | None
@@ -466,15 +474,15 @@ class Round(NamedTuple):
     number: Array
 
     def told(self):
-        """What the `Solution` tells of it."""
+        """The fields of the `Solution` about its error."""
         return {"error": self.error, "allowed": self.allowed}
 
 
 def tighten(once: Callable, judge: Callable, one: Array) -> Round:
-    """The last `Round`; none of it is differentiable, and all of it may be a batch, which goes on until all are done.
+    """The last `Round`. It is not differentiable. It may be a batch, which continues until all members are finished.
 
-    once: share -> run, `Steps`, their ends; judge: a run, the one before, share of their difference -> error, allowed;
-    one: the share to begin with, or one for each member.
+    once: share -> run, `Steps`, their ends; judge: run, previous run, share of their difference -> error, allowed; one:
+    the first share, or one for each member.
     """
     found = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(once, one))
     error, allowed = jax.tree.map(jnp.zeros_like, jax.eval_shape(judge, found[0], found[0], one))
@@ -504,7 +512,8 @@ def tighten(once: Callable, judge: Callable, one: Array) -> Round:
 
 
 def accepted_run(last, over, start):
-    """`last.run`, with the derivatives of over(start, steps, ends), a run over its steps that only they ask for."""
+    """`last.run`, with the derivatives of over(start, steps, ends), a run with its steps that is only computed for
+    derivatives."""
     over, closed_over = hoisted(over, start, last.steps, last.ends)
 
     def again(_, *args):
@@ -521,19 +530,20 @@ ALARM = 10  # times what was asked for, above which the error of a run is a fail
 
 
 def scaled(control: Adaptive, share: Real) -> Adaptive:
-    """So much of the tolerance."""
+    """The control with the tolerance multiplied by a share."""
     return replace(control, **{name: share * getattr(control, name) for name in ("rtol", "atol", "atol_v")})
 
 
 def verified(run: Solution, finer: Solution, control: Adaptive, order: int):
-    """What a `Solution` tells of its error, by Richardson from a finer run; constant to derivatives."""
+    """The fields of a `Solution` about its error, by Richardson extrapolation from a finer run; constants for
+    derivatives."""
     left = 0.25 if control.verify == "tolerance" else 0.5**order  # of the error
     error, tolerance = compared(run, finer, 1 / (1 - left), control)
     return {"error": error, "allowed": ALARM * tolerance}
 
 
 def compared(run: Solution, other: Solution, share: Real, control: Adaptive):
-    """So much of the difference at each of the times, in its largest coordinate, and what is asked for."""
+    """A share of the difference at each of the times, in its largest coordinate; and the allowed error."""
 
     def largest(q: Array) -> Array:
         return jnp.max(jnp.stack([jnp.max(jnp.abs(x).reshape(len(x), -1), axis=1) for x in jax.tree.leaves(q)]), axis=0)

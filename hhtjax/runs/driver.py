@@ -1,7 +1,7 @@
-"""The way of every run: begin, step from sample to sample, and tell what came out.
+"""The common driver of all runs: start, step from sample to sample, and return the results.
 
-`simulate`, with equal steps, given steps or steps under error control, and each member of a `sweep` go through `drive`.
-They differ in how long their steps are, and in where their samples lie; events are there where they are asked for.
+`simulate`, with equal steps, given steps or steps under error control, and each member of a `sweep` call `drive`. They
+differ in their step sizes and in the positions of their samples. Events are added if there are any.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ def drive(
     factors=None,
     caller: str = "simulate",
 ) -> Solution:
-    """The `Solution` of a `Problem`: every run of the library comes through here.
+    """The `Solution` of a `Problem`. Every run of the library calls this function.
 
-    steps: (flat, stepper, q, v, t0, params) -> `Loop`, which knows how long steps are.
-    sampling: `Run` -> what its loop carries in the end, and the function that makes the `Solution` of a `Failure`.
-    events, room: a list of `Event`, how many of them may divide a step, and how many are told. between: whether samples
-        lie within steps, so that the pieces of the last one are kept.
-    factors: those of `FlatSystem`, where they are known. caller: whom an error in a user's function names.
+    steps: (flat, stepper, q, v, t0, params) -> `Loop`, which contains the step sizes.
+    sampling: `Run` -> the final carry of its loop, and the function that makes the `Solution` for a `Failure`.
+    events, room: a list of `Event`, how many of them may divide a step, and how many are recorded. between: whether
+        samples lie within steps, so that the pieces of the last step are kept.
+    factors: the `FlatSystem` factors, if they are known. caller: the function named by an error in a user's function.
     """
     flat, q, v, t0, params = problem.flat(caller)
     plain = loop = steps(flat._replace(factors=factors), problem.stepper, q, v, t0, params)
@@ -67,7 +67,7 @@ def drive(
 
 
 class Run(NamedTuple):
-    """A run before its first step. form: how what the loop carries is stepped, as arrays or number by number."""
+    """A run before its first step. form: whether the carry of the loop consists of arrays or of single numbers."""
 
     problem: Any
     flat: FlatSystem
@@ -77,10 +77,10 @@ class Run(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """What a run is made of. carry: (state, number of steps, first failure), before the first; advance: carry -> carry,
-    Info; keep: state -> what is saved; no_info: what `join_info` leaves unchanged; bound: params -> advance; sizes:
-    number of steps taken -> the size of the next, and of the last; start: the state at t0, as it is saved; past: bound,
-    sizes -> advance past events; now: what events carry along -> the params after them."""
+    """The parts of a run. carry: (state, number of steps, first failure), before the first step; advance: carry ->
+    carry, Info; keep: state -> saved values; no_info: the neutral element of `join_info`; bound: params -> advance;
+    sizes: number of steps taken -> the size of the next step, and of the previous one; start: the state at t0, as it is
+    saved; past: bound, sizes -> advance with events; now: carry of events -> the params after them."""
 
     carry: PyTree
     advance: Callable
@@ -115,7 +115,7 @@ def equal_steps(flat: FlatSystem, stepper: Stepper, q: Array, v: Array, t0: Arra
 def given_steps(
     flat: FlatSystem, stepper: Stepper, q: Array, v: Array, t0: Array, params: PyTree, dt: Array, grows: bool
 ) -> Loop:
-    """The `Loop` over steps dt (N,); NaN from one on that is not positive."""
+    """The `Loop` over steps dt (N,); NaN from the first one on that is not positive."""
     dt = jnp.where((dt > 0) & jnp.isfinite(dt), dt, jnp.nan)
     steps = dt, jnp.concatenate([dt[:1], dt[:-1]]), t0 + jnp.cumsum(dt)
 
@@ -136,9 +136,10 @@ def steps_of(
     resolves: bool = False,
     grows: bool = False,
 ) -> Loop:
-    """The `Loop` over steps of any sizes: number of steps taken -> the next, the one before, and where it ends.
+    """The `Loop` over steps of any sizes: number of steps taken -> the next size, the previous one, and the end of the
+    step.
 
-    resolves: whether the first is one of error control. grows: of `resized_step`."""
+    resolves: whether the first step is chosen by error control. grows: see `resized_step`."""
     stepper = stepper.astype(q.dtype)
     none = jnp.zeros((), jnp.int32)
     first = sizes(none)[0]
@@ -172,7 +173,8 @@ def steps_of(
 
 
 def counted(take_step: Callable, flat: FlatSystem, t0: Array, dt: Array, before: Array | None = None):
-    """The step of a run, on (state, number of steps, first failure); also its `Info`. before: steps taken at t0."""
+    """The step of a run, on (state, number of steps, first failure); also returns its `Info`. before: steps taken at
+    t0."""
 
     def step(carry: tuple):
         state, count, failure = carry
@@ -186,14 +188,14 @@ def counted(take_step: Callable, flat: FlatSystem, t0: Array, dt: Array, before:
 
 
 def resting(advance: Callable, by_itself: bool, run: tuple, info: Info, here: Array):
-    """The run and what is known of it after a step, or, not `here`, without. by_itself: whether `advance` can rest."""
+    """The run and its info after the step if `here` is true, else unchanged. by_itself: whether `advance` can rest."""
     after, more = advance(run, here) if by_itself else advance(run)
     info = tree_where(here, join_info(info, more), info)
     return after if by_itself else if_any(partial(tree_where, here), ~here, after, run, kept=False), info
 
 
 def saved(flat: FlatSystem, state: State):
-    """What a run saves of a state."""
+    """The values of a state that a run saves."""
     state = public(flat, state)
     return state.t, state.q, state.v, state.w, state.L, state.z, state.zdot, state.friction, state.contact
 
@@ -207,7 +209,7 @@ def as_solution(
 
 
 def as_path(flat, path: tuple) -> Solution:
-    """What was saved, with a leading axis, as a `Solution` that knows nothing else."""
+    """The saved values, with a leading axis, as a `Solution` without other information."""
     t, q, v, w, L, *z, friction, contact = path
     q = jax.vmap(flat.unravel)(q)
     v, w = (None if x is None else jax.vmap(flat.unravel_rates)(x) for x in (v, w))
@@ -220,12 +222,12 @@ def as_path(flat, path: tuple) -> Solution:
 
 
 def with_flaw(failure: Failure, flaw: Array | None) -> Failure:
-    """The failure, or that of a mass that is none at the start."""
+    """The failure, or the failure of a wrong mass at the start."""
     return failure if flaw is None else failure._replace(step=jnp.where(flaw > 0, 1, failure.step), mass=flaw)
 
 
 def flaw_at_start(system, flat, start, params: PyTree):
-    """What is wrong with the mass there, where it is a function; a constant one has been looked at."""
+    """What is wrong with the mass at the start, if it is a function; a constant mass has been checked before."""
     if not callable(getattr(system, "mass", None)):
         return None
     flaw = mass_flaw(flat.mass(start.q, start.t, params), system.constraint is not None or system.massless is not None)
@@ -236,15 +238,15 @@ def flaw_at_start(system, flat, start, params: PyTree):
 
 
 def with_contact_start(run: Solution, flat: FlatSystem, start: State, params: PyTree) -> Solution:
-    """The run, or one that has failed where bodies overlap at the start, or go into each other, or where coefficients
-    are out of their range."""
+    """The run; or a failed one, if bodies overlap or approach each other at the start, or coefficients are out of
+    range."""
     flaw = jnp.max(start_flaws(flat, start.q, start.v, start.t, params))
     step, code = jnp.where(flaw > 0, 1, run.failure.step), jnp.where(flaw > 0, flaw, run.failure.contact)
     return run._replace(failure=run.failure._replace(step=step, contact=code))
 
 
 def no_failure(info: Info) -> Failure:
-    """What `Solution.failure` says of a run in which all went well."""
+    """The `Failure` of a run without failures."""
     none = jnp.zeros((), jnp.int32)
     return Failure(
         none, jnp.array(False), none, info.dependent_row, info.solve_residual, info.friction, contact=info.contact
@@ -252,7 +254,8 @@ def no_failure(info: Info) -> Failure:
 
 
 def first_failure(flat: FlatSystem, failure: Failure, count: Array, state: State, info: Info) -> Failure:
-    """The failure so far, or this step's. Of several quantities an internal state is named, then the first."""
+    """The failure so far, or the failure of this step. Of several quantities an internal state is named, else the
+    first."""
     _, *values, _, _ = saved(flat, state)
     known = [(i, x) for i, x in enumerate(values) if x is not None]
     known.sort(key=lambda x: x[0] < INTERNAL_STATE)
@@ -262,7 +265,7 @@ def first_failure(flat: FlatSystem, failure: Failure, count: Array, state: State
 
 
 def told_failure(info: Info) -> Array:
-    """Whether a step says by itself that it failed."""
+    """Whether a step reports a failure itself."""
     failed = jnp.array(False) if info.dependent_row is None else info.dependent_row >= 0
     for well in (info.converged, info.solved):
         failed = failed if well is None else failed | ~well
@@ -270,7 +273,7 @@ def told_failure(info: Info) -> Array:
 
 
 def failure_of(known: list, count: Array, info: Info, failure: Failure) -> Failure:
-    """The same, from each quantity by itself, [(number, array)]."""
+    """As above, from each quantity separately, [(number, array)]."""
     quantity, finite = jnp.zeros((), jnp.int32), jnp.array(True)
     for i, x in reversed(known):
         fine = jnp.all(jnp.isfinite(x))
@@ -298,7 +301,7 @@ def failure_of(known: list, count: Array, info: Info, failure: Failure) -> Failu
 
 
 def neutral_info(shapes: Info) -> Info:
-    """What `join_info` leaves unchanged."""
+    """The neutral element of `join_info`."""
     neutral = Info(*(None if x is None else jnp.asarray(x.dtype == bool, x.dtype) for x in shapes))
     return neutral if neutral.dependent_row is None else neutral._replace(dependent_row=-1 - neutral.dependent_row)
 
@@ -318,9 +321,9 @@ def loop_with_events(
     in_pieces: bool = False,
     with_modes: bool = False,
 ) -> Loop:
-    """The `Loop` with events: its carry has `EventState` behind (state, number of steps, first failure).
+    """The `Loop` with events: its carry has an `EventState` after (state, number of steps, first failure).
 
-    in_pieces: whether that has the `Pieces` of the last step; with_modes: whether these have the modes.
+    in_pieces: whether that contains the `Pieces` of the last step; with_modes: whether these contain the modes.
     """
     start = loop.carry[0]
     stepper = stepper.astype(start.v.dtype)
@@ -338,9 +341,10 @@ def loop_with_events(
 
 
 def step_with_events(context, params: PyTree, bound, sizes):
-    """The step of a run with events, which rests where not `here`.
+    """The step of a run with events. It leaves the run unchanged if `here` is false.
 
-    bound: params -> the step without. sizes: number of steps taken -> the size of this one, and of the one before.
+    bound: params -> the step without events. sizes: number of steps taken -> the size of this step, and of the previous
+    one.
     """
     events, pass_them = context.events, passage(context)
     fixed = None if events.switches else bound(params)
@@ -376,7 +380,8 @@ def may_meet(context: EventContext, part: SubStep, h: Array, params: PyTree) -> 
 
 
 def passage(context):
-    """The function of a step and the log, with the counts of steps before and after it, that passes its events."""
+    """The function that handles the events of a step and records them. It also takes the counts of steps before and
+    after."""
 
     @checkpoint  # reverse mode would keep all that is in there for each step
     def noted(now: tuple, h: Array, params: PyTree):
@@ -396,7 +401,7 @@ def passage(context):
 
 
 def at_rest(here: Array | None, new: PyTree, old: PyTree):
-    """The new, or, where a member of a sweep rests, the old."""
+    """The new values; the old ones if a member of a sweep rests."""
     return new if here is None else tree_where(here, new, old)
 
 

@@ -1,4 +1,4 @@
-"""One step under error control: tried, judged by the estimate of its error, taken or not; and how long the next is."""
+"""One step under error control: tried, its error estimated, accepted or rejected, and the size of the next chosen."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ DONE, TOO_SHORT, TOO_MANY, BROKEN, AT_EVENT = range(5)
 
 
 class Controller(NamedTuple):
-    """Of the factors by which steps change: the PI controller's exponents, divided by the order of the estimate, and
-    bounds behind a step that was accepted. Growth by more than 2 is unstable for some methods."""
+    """The PI controller of the step size: its exponents, divided by the order of the estimate, and bounds of the factor
+    by which a step changes after an accepted one. Growth by more than 2 is unstable for some methods."""
 
     safety: float = 0.9
     proportional: float = 0.7
@@ -57,7 +57,7 @@ PI = Controller()
 
 
 class Walk(NamedTuple):
-    """What the loop carries."""
+    """The carry of the loop over trial steps."""
 
     state: PyTree
     h: Array
@@ -74,7 +74,8 @@ class Walk(NamedTuple):
 
 
 class StepTrial(NamedTuple):
-    """How steps are tried, to the time `end`. context, past_events: how to pass events, and what a trial becomes so."""
+    """How steps are tried, up to the time `end`. context: how events are handled; past_events: turns a trial step into
+    one that handles them."""
 
     flat: FlatSystem
     stepper: Any  # a `Stepper` that estimates the error of its steps
@@ -88,8 +89,8 @@ class StepTrial(NamedTuple):
     stops: Any = None  # times at which steps end, too
 
     def proposed(self, walk: Walk, params: PyTree) -> Walk:
-        """The walk with the next step of a stepper that knows it by itself, and what it knows it from; sizes are those
-        that come with the tolerances."""
+        """The walk with the next step proposed by the stepper itself, if it does so, and the data from which it derived
+        it. The sizes passed to it include the absolute tolerances."""
         if not self.stepper.proposes:
             return walk
         rtol, atol, atol_v = self.bounds[:3]
@@ -103,8 +104,8 @@ class StepTrial(NamedTuple):
 
 
 class TrialStep(NamedTuple):
-    """A step that was tried: the walk if it is accepted, its error, the step to try next, what of it must not fall
-    below the least step, and why there are no more steps if it does."""
+    """A trial step: the walk if it is accepted, its error, the step size to try next, the size that must not fall below
+    dt_min, and the reason to stop if it does."""
 
     walk: Walk
     error: Any
@@ -114,7 +115,7 @@ class TrialStep(NamedTuple):
 
 
 class Begun(NamedTuple):
-    """What else is known of a try: the state it began with, when it was to end, and its `Info`."""
+    """More about a trial step: the state it started from, its planned end, and its `Info`."""
 
     state: PyTree
     end: Any
@@ -122,7 +123,7 @@ class Begun(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """Tolerances and bounds in the dtype of the state. scale: the tolerance of the run, relative to that of a step."""
+    """Tolerances and bounds in the dtype of the state. scale: the tolerance of the run divided by that of a step."""
 
     rtol: Array
     atol: Array  # of positions
@@ -133,7 +134,7 @@ class Bounds(NamedTuple):
 
     @classmethod
     def of(cls, flat: FlatSystem, stepper, control: Adaptive, t0: Array, end: Array) -> Bounds:
-        """Those of an `Adaptive`."""
+        """The bounds of an `Adaptive`."""
         names = "rtol", "atol", "atol_v", "dt_min", "dt_max"
         rtol, atol, atol_v, least, most = (jnp.asarray(getattr(control, name)).astype(t0.dtype) for name in names)
         n, N = flat.positions, flat.size
@@ -143,7 +144,7 @@ class Bounds(NamedTuple):
         return cls(rtol, atol, each, rtol**power, jnp.maximum(least, rounding), most)
 
     def relative(self, flat: FlatSystem, errors: Errors, q_size: Array, v_size: Array) -> Array:
-        """The largest error, 1 where it is the tolerance."""
+        """The largest error divided by its tolerance."""
         # reciprocals, which are there before the errors are
         error = jnp.max(jnp.abs(errors.v) * (self.scale / (self.atol_v + self.rtol * v_size)))
         if flat.positions:
@@ -152,7 +153,7 @@ class Bounds(NamedTuple):
         return error
 
     def first(self, state: State, v_size: Array, span: Array) -> Array:
-        """A step that changes v by about its tolerance, and not more than a hundredth of all."""
+        """A first step that changes v by about its tolerance, at most a hundredth of the run."""
         tiny = float(jnp.finfo(span.dtype).tiny)
         slow = (self.atol_v + self.rtol * v_size) / self.scale / jnp.maximum(jnp.abs(state.w), tiny)
         h = jnp.minimum(jnp.min(jnp.sqrt(slow)), jnp.minimum(span / 100, self.most))
@@ -160,13 +161,13 @@ class Bounds(NamedTuple):
 
 
 def sizes(flat: FlatSystem, state: State):
-    """Of positions and rates."""
+    """The sizes of positions and of rates."""
     return kinematics.sizes(flat.blocks, state.q), jnp.abs(state.v)
 
 
 def next_step(h: Array, error: Array, before: Array, accept: Array, order: int, pi: Controller = PI):
-    """The PI controller: Gustafsson's, in the form of Hairer and Wanner, Sec. IV.2; before, and what is returned beside
-    the step, are logarithms of errors."""
+    """The PI controller of Gustafsson, in the form of Hairer and Wanner, Sec. IV.2. `before`, and the second result,
+    are logarithms of errors."""
     now = approximate_log(jnp.maximum(error, 1e-10))
     slope = jnp.where(accept, -pi.proportional / order, -1 / order)
     exponent = slope * now + jnp.where(accept, pi.integral / order * before, 0)
@@ -176,7 +177,7 @@ def next_step(h: Array, error: Array, before: Array, accept: Array, order: int, 
 
 
 def judged(state: State, info: Info, error: Array) -> Array:
-    """The error of a step, infinite where something that it tells is not fine."""
+    """The error of a step; infinite if the step is not finite, did not converge, or reports another failure."""
     for x in (state.q, state.v, state.w, state.L):
         error = error if x is None else error + jnp.sum(0 * x)  # NaN where one is not finite
     fine = error < jnp.inf
@@ -187,16 +188,17 @@ def judged(state: State, info: Info, error: Array) -> Array:
 
 
 def is_walking(walk: Walk, end: Array) -> Array:
-    """Whether there is more to try."""
+    """Whether there are steps left to try."""
     going = (walk.state.t < end) & (walk.stop == DONE)
     return going if walk.met is None else going & ~walk.met.ended
 
 
 def next_end(trial: StepTrial, params: PyTree, walk: Walk):
-    """The next step, and the time at which it ends: that of the walk, or one or two halves, to the end, or a jump.
+    """The next step, and the time at which it ends. The step is the proposed one, or one or two halves of the interval
+    to the end or the next jump.
 
-    Without rounding: what is left until a jump, less than the steps, and halved, would differ between a run and a batch
-    by more than the steps before, and so on from jump to jump.
+    Step sizes have their last bits cleared. Otherwise rounding differences between a run and a batch, in the interval
+    left before a jump, would grow from jump to jump.
     """
     t, end = walk.state.t, trial.end
     h, reach = (jnp.minimum(without_rounding(walk.h, more), trial.bounds.most) for more in (0, 4))
@@ -212,7 +214,7 @@ def next_end(trial: StepTrial, params: PyTree, walk: Walk):
 
 
 def trial_step(trial: StepTrial, walk: Walk):
-    """Walk -> Walk after one try, and how that began."""
+    """Walk -> Walk after one trial step, and how that step began."""
     bounds, order, params = trial.bounds, trial.stepper.estimate_order, trial.params_of(walk)
     asked = trial.proposed(walk, params)
     h, t1 = next_end(trial, params, asked)
@@ -235,7 +237,7 @@ def trial_step(trial: StepTrial, walk: Walk):
 
 
 def taken(trial: StepTrial, walk: Walk, tried: TrialStep) -> Walk:
-    """The walk after a try: taken, or to be taken again."""
+    """The walk after a trial step: with the step if it is accepted, else with a smaller step to try."""
     accept = tried.error <= 1
     again = walk._replace(rejected=walk.rejected + 1)
     if walk.met is not None:  # what is wrong there
@@ -247,13 +249,13 @@ def taken(trial: StepTrial, walk: Walk, tried: TrialStep) -> Walk:
 
 
 def why_short(error: Array) -> Array:
-    """Why there are no more steps if this one has become too short."""
+    """The reason to stop if this step has become too short."""
     return jnp.where(error < jnp.inf, TOO_SHORT, BROKEN)
 
 
 def begin(trial: StepTrial, q: Array, v: Array, t0: Array):
-    """The walk before its first step, and the state at t0 as it is saved. The method starts with the longest of these,
-    of which others are parts."""
+    """The walk before its first step, and the state at t0 as it is saved. The method is started with the longest step
+    considered for the start, of which shorter ones are parts."""
     flat, stepper, bounds = trial.flat, trial.stepper, trial.bounds
     longest = jnp.minimum((trial.end - t0) / 100, bounds.most)
     start, state = entered(
@@ -281,7 +283,7 @@ def begin(trial: StepTrial, q: Array, v: Array, t0: Array):
 def trial_of(
     problem: Problem, end: Array, bounds: Bounds, max_steps: int, events: tuple | None = None, room: tuple = ()
 ) -> StepTrial:
-    """How the steps of a problem are tried, with events or without."""
+    """How the steps of a problem are tried, with or without events."""
     flat, q, v, t0, params = problem.flat()
     stepper = problem.stepper.astype(q.dtype)
     trial = StepTrial(flat, stepper, params, end, bounds, max_steps)
@@ -298,14 +300,14 @@ def trial_of(
 
 
 def past_events(trial: StepTrial, tried: TrialStep, walk: Walk, h: Array) -> TrialStep:
-    """The try, past the events in its step."""
+    """The trial step, with the events that happen in it."""
     now = trial.context.during(trial.params, walk.state.t, h).params(trial.params, walk.met.modes)
     asked = (tried.error <= 1) & asks(trial.context, walk.state, tried.walk.state, now, walk.met.over, h)
     return call_where_alone(partial(passed, trial), asked, tried, walk, h)
 
 
 def passed(trial: StepTrial, tried: TrialStep, walk: Walk, h: Array) -> TrialStep:
-    """The same where there may be one."""
+    """As `past_events`, where there may be an event."""
     context = trial.context
     met = walk.met._replace(code=jnp.full_like(walk.met.code, FINE))
     part = SubStep.whole(context, walk.state, tried.walk.state, context.no_info, h, walk.last, met, ~met.ended)
@@ -328,7 +330,8 @@ def passed(trial: StepTrial, tried: TrialStep, walk: Walk, h: Array) -> TrialSte
 
 
 def behind(trial: StepTrial, tried: TrialStep, walk: Walk, part: SubStep, h: Array) -> TrialStep:
-    """The try with the error of the rest behind an event; so long as that is too large, the rest becomes shorter."""
+    """The trial step with the error of the remainder after an event. While that error is too large, the remainder is
+    shortened."""
     past, met = trial.stepper.begin_estimates(trial.flat, part.end), part.met
     reached = [(walk.q_size, walk.v_size), *(sizes(trial.flat, s) for s in (part.start, part.end))]  # and no farther
     q_size, v_size = (reduce(jnp.maximum, x) for x in zip(*reached, strict=True))
@@ -360,18 +363,17 @@ WHY = {
 
 @shown
 class Steps(NamedTuple):
-    """What error control chose.
+    """The steps that error control chose.
 
     Attributes:
-        dt: (N,) the accepted steps; inside jit (max_steps,), NaN behind them.
+        dt: (N,) the accepted steps; inside jit (max_steps,), NaN after the last one.
         accepted, rejected: their numbers.
         reached: the time at which they end; that of the last sample, unless they failed.
-        stop: why they ended: 0 all well, 1 below dt_min, 2 max_steps used up, 3 not finite, 4 what went wrong at an
-            event.
-        estimate: of the last step tried, relative to the tolerance.
-        dt_min: below which steps were not to fall.
-        event, guard: those of `Failure`, of the last step tried; None without events.
-        tightened: with `verify="tighten"` how much of the tolerance they were chosen for; None without.
+        stop: why they ended: 0 no failure, 1 below dt_min, 2 max_steps used up, 3 not finite, 4 a failure at an event.
+        estimate: the estimated error of the last trial step, relative to the tolerance.
+        dt_min: the lower bound of the steps.
+        event, guard: those of `Failure`, for the last trial step; None without events.
+        tightened: with `verify="tighten"`, the factor by which the tolerance was reduced; None without.
     """
 
     dt: Any
@@ -386,12 +388,13 @@ class Steps(NamedTuple):
     tightened: Array | None = None
 
     def check(self):
-        """Raises `SimulationError` naming why, and at which time, steps ended too early; for a batch the first."""
+        """Raises `SimulationError` if steps ended too early, naming the reason and the time; for a batch, of the first
+        that did."""
         if fault := self._fault():
             raise SimulationError(f"choose_steps: {fault}")
 
     def _fault(self):
-        """What is wrong, in words."""
+        """The message for what is wrong."""
         stop = np.asarray(self.stop)
         if not stop.any():
             return None
@@ -418,9 +421,9 @@ def select_steps(
     controller: Controller = PI,
     times: Array | None = None,
 ):
-    """`Steps` from t0 to end, and (max_steps,) the times at which they end, inf behind them; no tracer of autodiff may
-    come in. times: where samples are kept on the way, (K,); the third result is the `Solution` there, or None. end: or
-    the times, (K,), for a stepper that lands on them."""
+    """`Steps` from t0 to end, and (max_steps,) the times at which they end, inf after the last. Arguments must not be
+    tracers of autodiff. times: (K,), samples to keep during the run; the third result is then the `Solution` there,
+    else None. end: a time, or the times (K,) for a stepper that ends steps on them."""
     if progress:
         announce()
     stops, end = (end, end[-1]) if end.ndim else (None, end)
@@ -455,7 +458,7 @@ def select_steps(
         return largest_in_batch(carry[0].accepted + carry[0].rejected)
 
     def walked(carry: tuple, ahead: Callable):
-        """The walk on, while `ahead`; with a bar in blocks of tries, each a kernel."""
+        """Continues the walk while `ahead` is true; with a bar, in blocks of trial steps, each of them a kernel."""
         if not progress:
             return lax.while_loop(ahead, body, carry)
 
@@ -486,7 +489,7 @@ def select_steps(
 
 
 def as_steps(walk: Walk, times: Array, t0: Array, least: Array) -> Steps:
-    """The `Steps` of a walk that is over, which end at these times."""
+    """The `Steps` of a finished walk whose steps end at these times."""
     numbers = jnp.arange(times.size, dtype=jnp.int32)
     dt = jnp.where(numbers < walk.accepted, jnp.diff(times, prepend=t0), jnp.nan)
     steps = Steps(dt, walk.accepted, walk.rejected, walk.state.t, walk.stop, walk.error, least)
@@ -496,7 +499,7 @@ def as_steps(walk: Walk, times: Array, t0: Array, least: Array) -> Steps:
 
 
 def show(share, over):
-    """A bar on stderr; over: whether it is the last."""
+    """A progress bar on stderr; over: whether the run is finished."""
 
     def bar(share, over):
         done = int(100 * min(float(share), 1.0))
@@ -506,7 +509,8 @@ def show(share, over):
 
 
 def trimmed(steps: Steps) -> Steps:
-    """Without what is behind the accepted ones, of a batch the most, where their numbers are known."""
+    """Without the unused entries after the accepted steps (for a batch, after the longest member), if their number is
+    known."""
     if not is_concrete(steps.accepted):
         return steps
     dt, accepted = map(np.asarray, (steps.dt, steps.accepted))  # jnp would compile a program for each number
@@ -521,14 +525,16 @@ def trimmed(steps: Steps) -> Steps:
 
 
 class Since(NamedTuple):
-    """Of the steps since the last sample. first: what was saved at the beginning of the last; info: theirs, joined."""
+    """The steps since the last sample. first: what was saved at the start of the last step; info: their joined
+    `Info`."""
 
     first: PyTree
     info: Info
 
 
 class Recorder(NamedTuple):
-    """How walks in one form are recorded. none: `Since` before the first try; begin, end: what is kept of a state."""
+    """How samples of a walk are recorded. none: the `Since` before the first trial step; begin, end: what is kept of a
+    state."""
 
     none: Since
     begin: Callable
@@ -540,7 +546,8 @@ class Recorder(NamedTuple):
     def of(
         cls, flat: FlatSystem, stepper: Stepper, form, info: Info, output=None, params: PyTree = None, long=None
     ) -> Recorder:
-        """info: that of a try, for its structure. output: what is read off, with params; long: of `read_between`."""
+        """info: that of a trial step, for its structure. output: the output function, evaluated with params; long: see
+        `read_between`."""
         begin, end = form.of(partial(saved, flat)), form.of(partial(kept, flat, stepper))
         since = Since(begin(form.tree.state), neutral_info(info))
         if output is None:
@@ -552,11 +559,13 @@ class Recorder(NamedTuple):
         return cls(since, begin, end, form.of(read), not output.beside_path)
 
     def add(self, since: Since, begun: Begun, accepted: Array) -> Since:
-        """Since, with a try; of one that is rejected the beginning too: it is that of the next."""
+        """`since` with one more trial step. Also a rejected step sets the beginning, which is that of the next
+        trial."""
         return Since(self.begin(begun.state), tree_where(accepted, join_info(since.info, begun.info), since.info))
 
     def sample(self, since: Since, state: State, time: Array):
-        """Since a sample before this state, and what lies around it: in a step, whose end this is."""
+        """The steps since a sample before this state, and the values around the sample, which lies in the step that
+        ends in this state."""
         end = self.end(state)
         found = None if self.read is None else self.read(since.first, end, time)
         return since._replace(info=self.none.info), (
@@ -567,7 +576,7 @@ class Recorder(NamedTuple):
 
 
 def solution(problem: Problem, start: State, around: tuple, times: Array, reached: Array) -> Solution:
-    """The `Solution` at the times, from what was kept around them."""
+    """The `Solution` at the times, from the values kept around them."""
     flat, _, _, _, params = problem.flat()
     around, found, info = around
     flaw, failure = flaw_at_start(problem.system, flat, start, params), no_failure(jax.tree.map(lambda x: x[0], info))

@@ -1,10 +1,11 @@
-"""A step across events: find the first, step to it, change the velocity or the params, begin anew, go on to the end.
+"""A step with events: find the first event, step to it, change the velocity or the params, restart, finish the step.
 
     0 = g(step(s, tau)),   e = step(s, tau),   v := reset(e),  params := switch(params),   s1 = step(begin(e), h - tau)
 
-so that the grid stays what it was, and the order that of the stepper. tau is found on the cubic through g and its rate
-at both ends, and made exact by Newton, on steps of size tau; its derivative is that of the implicit function.
-A rest of a millionth of the step is a Taylor polynomial: skipping it would lose the derivative of tau.
+The time grid does not change, and the order is that of the stepper. tau is first found on the cubic through g and its
+rate at both ends, and then made exact by Newton's method on steps of size tau. Its derivative follows from the
+implicit-function theorem. If the remainder is shorter than a millionth of the step, it is a Taylor polynomial: without
+it the derivative of tau would be lost.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def asks(context: EventContext, s: State, s1: State, params: PyTree, over: list, h: Array) -> Array:
-    """Whether an event may fall into the step from s to s1: no more than a look at both ends, in few operations."""
+    """Whether the step from s to s1 may contain an event: a check of the guards at both ends, in few operations."""
     (g0, d0), (g1, d1) = context.events.still.both(context.flat, *lax.stop_gradient((s, s1)), params, over, h)
     noted = np.asarray(context.events.noted) & ~np.asarray(context.events.timed)
     if any(context.events.timed):
@@ -46,8 +47,8 @@ def asks(context: EventContext, s: State, s1: State, params: PyTree, over: list,
 
 
 def pass_events(context: EventContext, params: PyTree, part: SubStep, h: Array):
-    """The step across all events in it: a `SubStep`, of which end, info and met are to be used, and what to note of
-    them, rows and whether each is there. Members that have not asked stay as they are."""
+    """The step with all its events: a `SubStep`, of which end, info and met are used; and the records of the events:
+    rows, and whether each exists. Members that have not asked are unchanged."""
     context = context.during(params, part.start.t, h)
     if context.middle is not None:
         known, t = context.events.with_modes(params, part.met.modes), part.start.t
@@ -80,13 +81,13 @@ def pass_events(context: EventContext, params: PyTree, part: SubStep, h: Array):
 
 
 def unnoted(s: State):
-    """The row of no event, and that it is not there."""
+    """An empty row, and False for its existence."""
     row = row_of(s.t, jnp.zeros((), jnp.int32), s.t, s.q, s.v, s.v)
     return jnp.full_like(row, jnp.nan), jnp.array(False)
 
 
 def meet_or_flag(context: EventContext, now: tuple, going: Array, h: Array, params: PyTree):
-    """The part behind its first event, if it has one, and what to note; with what is wrong, if something is."""
+    """The remainder after its first event, if there is one, and the record of the event; also what went wrong."""
     part, noted = now
     found = look(context, part, params, h)
     here = going & jnp.any(found.hit)
@@ -98,7 +99,7 @@ def meet_or_flag(context: EventContext, now: tuple, going: Array, h: Array, para
 
 
 def flag(part: SubStep, bad: Array, code: int, which: Array) -> SubStep:
-    """The part with what went wrong, if it did: at the first of these events."""
+    """The part with the failure code, if something went wrong at the first of these events."""
     met = part.met
     bad = bad & jnp.any(which) & (met.code == FINE)
     first = jnp.min(jnp.where(which, jnp.arange(which.size, dtype=met.event.dtype), which.size))
@@ -107,8 +108,8 @@ def flag(part: SubStep, bad: Array, code: int, which: Array) -> SubStep:
 
 
 def begin(context: EventContext, e: State, v: Array, params: PyTree, h: Array, moves: bool = True) -> State:
-    """The state from which a step of size h goes at a new start, behind e with velocities v; moves: whether they may be
-    others."""
+    """The state from which a step of size h starts anew, after e with velocities v; moves: whether the velocities may
+    have changed."""
     new = staged(lambda q, v, t, h: entered(context.stepper, context.flat, q, v, t, params, h, moves=moves)[1])(
         e.q, v, e.t, h
     )
@@ -116,7 +117,7 @@ def begin(context: EventContext, e: State, v: Array, params: PyTree, h: Array, m
 
 
 def meet(context: EventContext, now: tuple, found: Found, h: Array, params: PyTree):
-    """The part of the step behind its first event, and what to note of that."""
+    """The remainder of the step after its first event, and the record of the event."""
     part, *_ = now
     events, met = context.events, part.met
     known = lax.stop_gradient((params, met.modes, part))
@@ -157,7 +158,8 @@ def behind(
     h: Array,
     params: PyTree,
 ) -> SubStep:
-    """The part of the step behind event i. at: the state and the `Info` before it, when, and g and dg/dt of all."""
+    """The remainder of the step after event i. at: the state and the `Info` before it, its time, and g and dg/dt of all
+    events."""
     events, (e, info, tau, g, d), (v, modes, over) = context.events, at, outcome
     then = context.params(params, modes)
     ends = pick(this, jnp.asarray(events.ends, h.dtype)) > 0
@@ -200,7 +202,7 @@ SHORT = 1e-6  # part of a step: a rest that needs no step
 
 
 class EventContext(NamedTuple):
-    """How to step, and what to look for."""
+    """How to step, and which events to look for."""
 
     flat: FlatSystem
     stepper: Stepper
@@ -212,25 +214,25 @@ class EventContext(NamedTuple):
     middle: Array | None = None  # of the step, where inputs are held
 
     def during(self, params: PyTree, t: Array, h: Array) -> EventContext:
-        """The same in a step h from t on."""
+        """The context for a step of size h from t on."""
         return self._replace(middle=t + h / 2) if zero_order_hold.holds(params) else self
 
     @property
     def slots(self) -> int:
-        """How often a step is looked at. Between events that divide it, of which there may be max_events, each noted
-        one may happen once, and one that only seemed to touch its guard; in the end there is none."""
+        """The largest number of searches in a step. Up to max_events events divide it. Between them, each recorded
+        event may happen once, and one event may only seem to touch its guard. The last search finds none."""
         return (self.max_events + 1) * (2 + sum(self.events.noted))
 
     def params(self, params: PyTree, modes: list):
-        """Those with these modes, as they are in this step."""
+        """The params with these modes, as they are in this step."""
         params = self.events.with_modes(params, modes)
         return params if self.middle is None else zero_order_hold.held_at(params, self.middle)
 
 
 class EventState(NamedTuple):
-    """What a run with events carries along: numbers that switches changed, whether it has ended, what went wrong (code
-    and event), the `Log`, where it is read off between its steps the pieces of the last, and of each event with known
-    times how many of them are over."""
+    """The data of events that a run carries: numbers that switches changed, whether it has ended, what went wrong (code
+    and event), the `Log`, the pieces of the last step if it is sampled within steps, and for each event with known
+    times how many of them have passed."""
 
     modes: list
     ended: Array
@@ -242,10 +244,11 @@ class EventState(NamedTuple):
 
 
 class SubStep(NamedTuple):
-    """What is left of a step: from `start` to `end`, of the size `rest`; `last` is the size start.a is made for.
+    """The remainder of a step: from `start` to `end`, of size `rest`; `last` is the step size for which start.a was
+    computed.
 
-    Of each event: whether it is behind the motion, though the guard may not say so; whether it was met at the start,
-    beside others; whether it is still to happen there."""
+    For each event: whether the motion has passed it, although the guard may not show it; whether it happened at the
+    start, together with others; whether it must still happen there."""
 
     start: Any
     end: State
@@ -277,12 +280,13 @@ class SubStep(NamedTuple):
 
 
 def go(context: EventContext, params: PyTree, s: State, tau: Array, last: Array, h: Array):
-    """The step tau from a state, and its `Info`; a Taylor polynomial where tau is very short, 0 or a rounding below."""
+    """The step tau from a state, and its `Info`; a Taylor polynomial if tau is very short, 0, or negative by
+    rounding."""
     return context.reach(params, s, tau, last, h)
 
 
 def reaching(flat: FlatSystem, stepper: Stepper, no_info: Info):
-    """What `go` calls: one function for all places of a program, so that it is traced once."""
+    """The function that `go` calls; one for all places of a program, so that it is traced once."""
 
     @staged
     def reach(params: PyTree, s: State, tau: Array, last: Array, h: Array):
@@ -298,8 +302,8 @@ def reaching(flat: FlatSystem, stepper: Stepper, no_info: Info):
 
 
 class Pieces(NamedTuple):
-    """The parts of a step between its events, in their order: states (max_events + 1, ...) at which they start and end;
-    those there are not start at infinity. modes: in each the numbers that switches have changed, where asked for."""
+    """The parts of a step between its events, in their order: states (max_events + 1, ...) at which they start and end.
+    Unused parts start at infinity. modes: the numbers that switches have changed, for each part, if needed."""
 
     start: Any
     end: Any
@@ -307,7 +311,7 @@ class Pieces(NamedTuple):
 
     @classmethod
     def none(cls, state: State, number: int, modes=()) -> Pieces:
-        """Room for so many, like a state, none of them there."""
+        """Empty storage for `number` parts, for states of this form."""
         like, modes = jax.tree.map(lambda x: jnp.stack([jnp.zeros_like(x)] * number), (state, modes))
         return cls(like._replace(t=jnp.full_like(like.t, jnp.inf)), like, modes)
 
@@ -322,7 +326,7 @@ class Pieces(NamedTuple):
         return pieces._replace(start=pieces.start._replace(t=jnp.concatenate([pieces.start.t[:1], later])))
 
     def divided(self, event, start, end, modes=()) -> Pieces:
-        """The last of them ends at an event; a new one is behind it."""
+        """The last part ends at an event, and a new part follows."""
         new = jnp.sum(jnp.isfinite(self.start.t), dtype=jnp.int32)
 
         def put(rows: Array, x: Array, here: Array) -> Array:
@@ -334,7 +338,7 @@ class Pieces(NamedTuple):
         return Pieces(*(jax.tree.map(partial(put, here=new), old, x) for old, x in pairs))
 
     def around(self, t: Array) -> Pieces:
-        """The start and the end of the one in which a time lies, and the modes."""
+        """The start and the end of the part that contains a time, and its modes."""
         i = jnp.maximum(jnp.sum(self.start.t <= t, dtype=jnp.int32) - 1, 0)
         return jax.tree.map(lambda rows: lax.dynamic_index_in_dim(rows, i, keepdims=False), self)
 
@@ -352,9 +356,10 @@ ENOUGH = 1e-8  # part of a step by which Newton changes tau before its last, qua
 
 
 class Found(NamedTuple):
-    """Of each event: whether it falls into the part of a step, whether by a jump before that, where about (0 to 1),
-    before where, whether it only touches there, whether the motion stays beyond it, and was made to by the event
-    before, whether it is no number, and how large the guard is."""
+    """For each event: whether it happens in this part of a step; whether a jump before made it happen; its approximate
+    position (0 to 1); an upper bound of the position; whether it only touches the guard; whether the motion stays
+    beyond the guard, and whether the previous event caused this; whether the guard is NaN; and the size of the
+    guard."""
 
     hit: Array
     jumped: Array
@@ -368,7 +373,7 @@ class Found(NamedTuple):
 
 
 def look(context: EventContext, part: SubStep, params: PyTree, h: Array) -> Found:
-    """The events in what is left of a step, by the cubic through the guard and its rate at both ends."""
+    """The events in the remainder of a step, from the cubic through the guard and its rate at both ends."""
     part, params = lax.stop_gradient((part, params))
     now = context.params(params, part.met.modes)
     events, over = context.events.still, part.met.over
@@ -423,7 +428,7 @@ def look(context: EventContext, part: SubStep, params: PyTree, h: Array) -> Foun
 
 
 def shaken(events: FlatEvents, s: State, params: PyTree, over: list) -> Array:
-    """How much each guard changes where q and v do by roundings: of the size of those of its terms."""
+    """How much each guard changes if q and v change by roundings of their terms."""
 
     def moved(x: Array) -> Array:
         k = np.arange(x.size)
@@ -434,13 +439,14 @@ def shaken(events: FlatEvents, s: State, params: PyTree, over: list) -> Array:
 
 
 def lateness(events: FlatEvents, t: Array) -> Array:
-    """By how much an event may come after the end of a step, by rounding, and still be one of it."""
+    """How much later than the end of a step an event may be, by rounding, and still belong to the step."""
     return jnp.where(jnp.asarray(events.timed), SLOP * eps(t) * jnp.abs(t), 0)
 
 
 def first_time(context: EventContext, params: PyTree, part: SubStep, found: Found, h: Array):
-    """When the first of the events happens, and which are at that time: by Newton on all of them, kept between where
-    none is beyond its guard and where one is, from where the first cubic has its zero."""
+    """The time of the first of the events, and which events happen at that time. Newton's method on all of them starts
+    from the zero of the first cubic. It is kept between a time at which no guard is negative and one at which some
+    guard is."""
 
     def unfinished(now: tuple) -> Array:
         *_, change, k = now
@@ -470,8 +476,8 @@ def first_time(context: EventContext, params: PyTree, part: SubStep, found: Foun
 
 
 def first_of(events: FlatEvents, part: SubStep, found: Found, near: Array):
-    """The number of the event to be met now, and 1 for it: of those at one time the noted ones are first, for they see
-    the motion as it comes, and one that ends the run is last."""
+    """The index of the event to be handled now, and 1 for it. Of simultaneous events the recorded ones are first, so
+    that they see the unchanged motion, and one that ends the run is last."""
     ranks = np.where(events.noted, 0, np.where(events.ends, 2, 1)) * len(events.noted)
     order = jnp.asarray(ranks + np.arange(ranks.size), jnp.int32)
     there = near & ~part.passed
@@ -483,8 +489,9 @@ def first_of(events: FlatEvents, part: SubStep, found: Found, near: Array):
 
 
 def reached(context: EventContext, params: PyTree, part: SubStep, tau: Array, h: Array):
-    """`go` from the start of a part. Where a guard sees multipliers they go over from a line to those of the step:
-    these are of order 2, but in a very short one they are not those of the start, and a guard must not jump."""
+    """`go` from the start of a part. If a guard uses multipliers, these are blended from linear interpolation to the
+    values of the step. The latter have order 2, but in a very short step they differ from those at the start, and a
+    guard must not jump."""
     s, info = go(context, params, part.start, tau, part.last, h)
     if any(context.events.forced):
         line = part.start.L + tau * context.events.slope(part.start, part.end, part.rest)
@@ -495,7 +502,7 @@ def reached(context: EventContext, params: PyTree, part: SubStep, tau: Array, h:
 def located(
     context: EventContext, params: PyTree, part: SubStep, this: Array, found: Found, tau: Array, h: Array
 ) -> Array:
-    """The time of an event, with its derivative; of multipliers that have jumped below zero that of the start."""
+    """The time of an event, with its derivative; if multipliers have jumped below zero it is the time of the start."""
     jumped = pick(this, found.jumped.astype(h.dtype)) > 0
 
     def guard(tau: Array):
@@ -507,18 +514,19 @@ def located(
 
 
 def improved(x: Array, y: Array, slope: Array, low: Array, high: Array) -> Array:
-    """A zero by a step of Newton's method from x, where y falls; the middle where it does not, or leaves its bounds."""
+    """A zero by a step of Newton's method from x, if y falls there and the step stays in its bounds; else the middle of
+    the bounds."""
     new = x - y / jnp.where(slope < 0, slope, 1)
     return jnp.where((slope < 0) & (new >= low) & (new <= high), new, (low + high) / 2)
 
 
 def beside_zero(rate: Array, h: Array, size: Array) -> Array:
-    """How far from zero a guard may be where its event was found, of numbers of this size."""
+    """How far from zero a guard may be at its event, if its terms are of this size."""
     return 1e-3 * jnp.abs(rate) * h + 1e3 * eps(h) * size
 
 
 def nearness(x: Real) -> float:
-    """The part of a step within which two times are one."""
+    """The fraction of a step within which two times count as equal."""
     return max(TOGETHER, 1e3 * eps(x))
 
 
@@ -528,5 +536,5 @@ def eps(x: Real) -> float:
 
 
 def pick(this: Array, x: Array) -> Array:
-    """The number of this event; others may be anything."""
+    """The value for this event; those of others may be anything."""
     return jnp.sum(jnp.where(this > 0, x, 0))

@@ -1,7 +1,7 @@
-"""Members of a batch, some at a time, handed to any executor of the standard library's kind.
+"""Runs the members of a batch in chunks, by any executor with the interface of the standard library.
 
-A task is a chunk of members: their arrays, and the program, which a worker compiles once (workers.py). So many tasks
-are handed out ahead; one that fails is tried again; those that are not begun are taken back when the caller is
+A task is a chunk of members: their arrays, and the program, which a worker compiles once (workers.py). A limited number
+of tasks is submitted ahead. A failed task is tried again. Tasks that have not started are cancelled when the caller is
 interrupted.
 """
 
@@ -40,40 +40,41 @@ def _leaves(f: Callable, shared: list, own: list) -> list:
 
 
 class Chunks(NamedTuple):
-    """Members 0, 1, ... size - 1, so many at a time. The last chunk repeats the last member."""
+    """The division of members 0, 1, ... size - 1 into chunks. The last chunk is padded with the last member."""
 
     size: int
     length: int
 
     @classmethod
     def of(cls, size: int, most: int) -> Chunks:
-        """No more chunks than have to be, with `most` members at most, and about equally many in each."""
+        """The smallest number of chunks with `most` members at most, of about equal lengths."""
         return cls(size, -(-size // -(-size // most)))
 
     @property
     def number(self) -> int:
-        """Of chunks."""
+        """The number of chunks."""
         return -(-self.size // self.length)
 
     def members(self, k: int) -> np.ndarray:
-        """Of a chunk, (length,)."""
+        """The members of a chunk, (length,)."""
         return np.minimum(np.arange(k * self.length, (k + 1) * self.length), self.size - 1)
 
     def kept(self, k: int) -> int:
-        """How many members of a chunk are its own."""
+        """How many members of a chunk are not padding."""
         return min(self.length, self.size - k * self.length)
 
     def named(self, k: int) -> str:
-        """For messages."""
+        """The members of a chunk in words, for messages."""
         first, last = k * self.length, k * self.length + self.kept(k) - 1
         return f"member {first}" if first == last else f"members {first} to {last}"
 
 
 class Work(NamedTuple):
-    """A function f(shared, own) of lists of arrays, hashable, and what it is called with for each chunk.
+    """A function f(shared, own) of lists of arrays, hashable, and its arguments for each chunk.
 
-    shared: arrays, and Python numbers, which are weak; own: numbers of members -> theirs; fitting: of the system in it,
-    by which `Programs` choose; alone: the same function where this process has programs of its own for it."""
+    shared: arrays, and Python numbers, which are weakly typed; own: indices of members -> their arrays; fitting: the
+    property of the system by which `Programs` choose; alone: the same function for this process, if it has its own
+    programs for it."""
 
     f: Callable
     shared: list
@@ -83,26 +84,26 @@ class Work(NamedTuple):
     alone: Callable | None = None
 
     def arrays(self, k: int) -> list:
-        """Those of a chunk."""
+        """The arguments for a chunk."""
         return self.own(self.chunks.members(k))
 
     def like(self) -> PyTree:
-        """What it returns: shapes and dtypes."""
+        """Shapes and dtypes of the result."""
         return jax.eval_shape(partial(_run.usual, self.f), self.shared, self.arrays(0))
 
     def here(self, k: int) -> list[np.ndarray]:
-        """The leaves of what it returns for a chunk, by this process."""
+        """The leaves of the result for a chunk, computed by this process."""
         given = self.shared, self.arrays(k)
         if self.alone is not None:
             return [np.asarray(x) for x in jax.tree.leaves(self.alone(*given))]
         return [np.asarray(x) for x in _leaves(self.f, *given, **self.fitting)]
 
     def text(self) -> str:
-        """What XLA is given, by which one program is told from another."""
+        """The program given to XLA, which identifies it."""
         return _leaves.lower(self.f, self.shared, self.arrays(0), **self.fitting).as_text()
 
     def packed(self, caller: str) -> Packed:
-        """For workers."""
+        """The program in the form that workers receive."""
         try:
             exported, options = _leaves.exported(self.f, self.shared, self.arrays(0), **self.fitting)
             return packed(exported, self.shared, options)
@@ -110,14 +111,14 @@ class Work(NamedTuple):
             if "callback" not in str(error):
                 raise
             raise NotImplementedError(
-                f"{caller}: with an `executor`, no function may call back to Python, which cannot cross: "
+                f"{caller}: with an `executor`, no function may call back to Python, which workers cannot do: "
                 "leave out progress=True, and sparse systems, whose equations SciPy solves; or leave out `executor`."
             ) from error
 
 
 @dataclass(frozen=True)
 class Hands:
-    """Who works, and how they are treated; made by `require_executor`."""
+    """An executor and how tasks are given to it; made by `require_executor`."""
 
     caller: str
     executor: Executor
@@ -126,8 +127,8 @@ class Hands:
     progress: bool
 
     def work(self, task: Callable, chunks: Chunks, these: Iterable[int], arguments: Callable, take: Callable):
-        """task(*arguments(k, ticket)) for each of these chunks k, and take(k, result) as they come. ticket: another one
-        for each try."""
+        """Runs task(*arguments(k, ticket)) for each of these chunks k, and calls take(k, result) for each result.
+        ticket: a different one for each try."""
         waiting, flying, tries = deque(these), {}, Counter()
         ended: SimpleQueue[Future] = SimpleQueue()
         call, total, done = uuid.uuid4().hex, len(waiting), 0
@@ -169,7 +170,7 @@ class Hands:
         return future
 
     def _require_another(self, members: str, error: Exception, tries: int):
-        """An error unless a task that failed may be tried again."""
+        """Raises an error unless a failed task may be tried again."""
         if isinstance(error, BrokenExecutor):
             raise self._died(members) from error
         if isinstance(error, Unfit):
@@ -184,14 +185,14 @@ class Hands:
 
     def _died(self, members: str) -> RuntimeError:
         return RuntimeError(
-            f"{self.caller}: a worker died at {members}, or beside them. It was killed, often because memory ran out "
-            "(a smaller `chunk` takes less), or it could not start: the call must stand under `if __name__ == "
-            "'__main__':` in a script. This executor is broken: make another one, and repeat the call."
+            f"{self.caller}: a worker died at {members}, or at members next to them. It was killed, often because "
+            "memory ran out (a smaller `chunk` takes less), or it could not start: the call must stand under `if "
+            "__name__ == '__main__':` in a script. This executor is broken: make another one, and repeat the call."
         )
 
 
 def _next(ended: SimpleQueue) -> Future:
-    """The next that has ended; interruptions come through."""
+    """The next finished task; interruptions pass through."""
     while True:
         try:
             return ended.get(timeout=PATIENCE)
@@ -202,7 +203,7 @@ def _next(ended: SimpleQueue) -> Future:
 def require_executor(
     caller: str, executor: Any, in_flight: int = IN_FLIGHT, retries: int = RETRIES, progress: bool = False
 ) -> Hands | None:
-    """The `Hands`; None without an executor."""
+    """The `Hands` for an executor; None without one."""
     in_flight = require_integer(caller, "in_flight", in_flight)
     retries = require_integer(caller, "retries", retries, least=0)
     if executor is None:
@@ -216,7 +217,7 @@ def require_executor(
 
 
 def collected(work: Work, hands: Hands | None, progress: bool = False, program: Packed | None = None) -> PyTree:
-    """The results of all members, in arrays of NumPy, by the hands, or by this process. program: for the hands."""
+    """The results of all members, as arrays of NumPy, by the workers or by this process. program: for the workers."""
     leaves, structure = jax.tree.flatten(work.like())
     chunks = work.chunks
     found = [np.empty((chunks.size, *x.shape[1:]), x.dtype) for x in leaves]
@@ -238,5 +239,5 @@ def collected(work: Work, hands: Hands | None, progress: bool = False, program: 
 
 
 def sent(x: Any) -> Any:
-    """A leaf as an array of NumPy; one of a weak type, such as a Python number, as it is."""
+    """A leaf as an array of NumPy; weakly typed leaves, such as Python numbers, are unchanged."""
     return x if not is_array(x) or getattr(x, "weak_type", False) else np.asarray(x)

@@ -24,10 +24,10 @@ MOST = 4  # levels; rounding and work grow with each
 
 
 def extrapolated(run: Callable, levels: int, order: int, join: Callable) -> Solution:
-    """The `Solution` without the leading errors in dt of several runs, at the saved times of the first.
+    """The `Solution` at the saved times of the first run, with the leading errors in dt removed by several runs.
 
-    run: k -> the `Solution` with steps of dt/k at the same saved times. order: of the stepper. join: two `Info` of an
-    interval into one. Rotations are moved along the one that leads from the coarse to the fine.
+    run: k -> the `Solution` with steps of dt/k at the same saved times. order: of the stepper. join: combines two
+    `Info` of an interval. Rotations are extrapolated along the rotation from the coarse to the fine one.
     """
     return _combine([run(2**level) for level in range(levels)], order=order, join=join)
 
@@ -59,13 +59,15 @@ def _combine(solutions: list, order: int, join: Callable) -> Solution:
 
 
 def _together(solutions: list) -> Array:
-    """Of each saved time, whether as many events come before it in all runs: else some are behind a jump there."""
+    """For each saved time, whether the same number of events lies before it in all runs. Otherwise some runs are after
+    a jump there and others before it."""
     before = [jnp.sum(run.events.t[None, :] <= run.t[:, None], axis=1, dtype=jnp.int32) for run in solutions]
     return reduce(jnp.logical_and, [number == before[-1] for number in before])
 
 
 def _events(runs: list, order: int, combine):
-    """The `Events` without their leading errors, and whether all runs met each. combine: their positions."""
+    """The `Events` without their leading errors, and whether all runs have the same events. combine: for their
+    positions."""
     finest = runs[-1]
     names = "t", "before", "after", "z", "rate"
     better = {name: richardson([getattr(events, name) for events in runs], order) for name in names}
@@ -75,7 +77,7 @@ def _events(runs: list, order: int, combine):
 
 
 def _told_apart(first: Solution, failure: Failure, same: Array) -> Failure:
-    """The failure, or that of runs that met other events."""
+    """The failure, or the failure that the runs have different events."""
     differ = ~jnp.all(same) & (failure.step == 0)
     here = jnp.argmin(same)
     ahead = jnp.maximum(first.events.t[here] - first.t[0], 0)
@@ -87,7 +89,7 @@ def _told_apart(first: Solution, failure: Failure, same: Array) -> Failure:
 
 
 def _positions(v: PyTree, gain: float, coarse: PyTree, fine: PyTree) -> PyTree:
-    """`take_out` of saved positions."""
+    """`take_out` for saved positions."""
 
     def turn(coarse: Array, fine: Array) -> Array:
         shape = fine.shape
@@ -101,7 +103,7 @@ def _positions(v: PyTree, gain: float, coarse: PyTree, fine: PyTree) -> PyTree:
 
 
 def _outputs(gain: float, coarse, fine):
-    """`take_out` of what a user's function returned; flags and numbers that count are those of the finest run."""
+    """`take_out` for the results of a user's function. Flags and integers are those of the finest run."""
 
     def leaf(coarse, fine):
         return take_out(gain, coarse, fine) if jnp.issubdtype(fine.dtype, jnp.floating) else fine
@@ -110,7 +112,7 @@ def _outputs(gain: float, coarse, fine):
 
 
 def _first(failures: list) -> Failure:
-    """The one that comes first in time, its step counted in those of the first run."""
+    """The earliest failure, with its step counted in steps of the first run."""
     first = failures[0]
     for level, failure in enumerate(failures[1:], 1):
         step = -(-failure.step // 2**level)
@@ -124,11 +126,11 @@ def _first(failures: list) -> Failure:
 
 
 def richardson(values: list, order: int, combine: Callable | None = None):
-    """Richardson's value of pytrees that belong to h, h/2, h/4, ..., with errors h^order, h^(order + 1), ...
+    """Richardson extrapolation of pytrees computed with h, h/2, h/4, ..., with errors h^order, h^(order + 1), ...
 
         fine + (fine - coarse)/(2^p - 1),    p = order, order + 1, ...
 
-    combine: (gain, coarse, fine) -> fine + gain (fine - coarse), in place of that on each leaf.
+    combine: (gain, coarse, fine) -> fine + gain (fine - coarse); it replaces this formula on each leaf.
 
     >>> [round(richardson([1 + h**2 + h**3 for h in (0.4, 0.2, 0.1)][:levels], 2), 6) + 0.0 for levels in (2, 3)]
     [0.989333, 1.0]

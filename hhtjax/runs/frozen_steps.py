@@ -1,7 +1,7 @@
-"""Steps that are chosen for one point, while the run over them is of another: how a fit freezes the steps of its runs.
+"""Frozen steps: a fit evaluates runs at one point with the steps that error control chose at another point.
 
-The residuals are evaluated for two points at once, as a batch whose axis has a name. Wherever they simulate under error
-control, inside whatever of jit, vmap and scan, the run takes the first point, and the choice of its steps the second.
+The residuals are evaluated for both points together, as a batch whose axis has a name. Wherever they simulate under
+error control, inside any jit, vmap and scan, the run uses the first point, and the choice of its steps the second.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CONTROLLED = {"run_over", "run_recorded", "run_chosen"}  # names of what runs ov
 
 
 def with_steps_for(f: Callable, x: Array, y: Array) -> Array:
-    """f(x) of an array x, with the steps of all runs under error control as for y.
+    """f(x) for an array x, with the steps of all runs under error control as chosen for y.
 
     >>> bool(with_steps_for(jnp.sin, jnp.ones(2), jnp.zeros(2))[0] == jnp.sin(1.0))
     True
@@ -32,8 +32,8 @@ def with_steps_for(f: Callable, x: Array, y: Array) -> Array:
 
 
 def run_and_choice(data: PyTree):
-    """What a run starts from, and what its steps are chosen for, constant to derivatives: the same, but inside
-    `with_steps_for`."""
+    """The start of a run, and the start for which its steps are chosen, constant for derivatives. Both are equal,
+    except inside `with_steps_for`."""
     if not is_pair():
         return data, lax.stop_gradient(data)
     both = jax.tree.map(lambda x: lax.all_gather(x, PAIR) if is_array(x) else (x, x), data)
@@ -42,9 +42,9 @@ def run_and_choice(data: PyTree):
 
 
 def frozen(f: Callable, *args: PyTree) -> PyTree:
-    """f(*args), constant to derivatives also in what f closes over, as a force does over what is differentiated.
+    """f(*args), constant for derivatives, also in values that f closes over, as a force may do.
 
-    args: the second of `run_and_choice`. To be called inside a jit: it compiles f anew.
+    args: the second result of `run_and_choice`. Call it inside a jit, because it compiles f anew.
 
     >>> float(jax.grad(lambda x: x * frozen(lambda y: x * y, 5.0))(3.0))
     15.0
@@ -54,7 +54,7 @@ def frozen(f: Callable, *args: PyTree) -> PyTree:
 
 
 def chooses_steps(f: Callable, *args: PyTree) -> bool:
-    """Whether there are runs under error control in f(*args).
+    """Whether f(*args) contains runs under error control.
 
     >>> chooses_steps(jnp.sin, jnp.ones(2))
     False
@@ -63,7 +63,7 @@ def chooses_steps(f: Callable, *args: PyTree) -> bool:
 
 
 def is_pair() -> bool:
-    """Whether both points of `with_steps_for` are here."""
+    """Whether both points of `with_steps_for` are present."""
     if not is_traced():  # JAX takes a millisecond to say that there is no such axis
         return False
     try:

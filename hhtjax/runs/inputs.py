@@ -1,4 +1,4 @@
-"""What a run starts from: the checks of what a user hands over, and the same on vectors."""
+"""Checks of the arguments of a run, and their conversion to vectors."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ if TYPE_CHECKING:
 
 
 class Problem(NamedTuple):
-    """A system, how to step it, and from where; params hold no functions, as `freeze` leaves them. output: an `Output`,
-    where a run saves that in place of its path."""
+    """A system, its stepper and its start. params hold no functions, as returned by `freeze`. output: an `Output`, if a
+    run saves it instead of its path."""
 
     system: Any
     stepper: Any  # the `Stepper`
@@ -71,7 +71,7 @@ class Problem(NamedTuple):
         t0: Real,
         z0: PyTree,
     ) -> Problem:
-        """The same of what a user hands over, or an error that names what is wrong with it."""
+        """The `Problem` of a user's arguments; raises an error that says what is wrong with them."""
         require_system(caller, system, massless=True)
         require_stepper(caller, stepper)
         params = require_params(caller, params)
@@ -93,19 +93,19 @@ class Problem(NamedTuple):
         return cls(system, stepper, q0, v0, params, t0, z0)
 
     def controlled(self, control: Adaptive) -> Problem:
-        """The same, its stepper as it is for a tolerance."""
+        """The problem, with the stepper in its form for a tolerance."""
         return self._replace(stepper=self.stepper.for_tolerance(control.rtol))
 
     def rates(self) -> int:
-        """How many there are, of coordinates: a rotation has three, and nine numbers."""
+        """The number of rates: a rotation has three."""
         return self.numbers() if self.v0 is None else sum(x.size for x in jax.tree.leaves(self.v0))
 
     def numbers(self) -> int:
-        """How many there are in the position."""
+        """The number of entries of the position: a rotation has nine."""
         return sum(x.size for x in jax.tree.leaves(self.q0))
 
     def dtype(self) -> np.dtype:
-        """That of the state."""
+        """The dtype of the state."""
         return jax.tree.leaves(self.q0)[0].dtype
 
     def times(self, t: Array) -> Array:
@@ -119,8 +119,8 @@ class Problem(NamedTuple):
 
 
 def _refuse_checked_axes(caller: str, *args: PyTree):
-    """Under `check_vma` of `jax.shard_map` each array says over which axes it varies. Constants must say so too, and
-    those of loops, branches and Jacobians do not here."""
+    """Raises an error under `check_vma` of `jax.shard_map`. There each array declares over which axes it varies.
+    Constants would have to do so too, and those of loops, branches and Jacobians do not here."""
     for x in jax.tree.leaves(args):
         kind = getattr(jax.typeof(x), "mat", None) if isinstance(x, Tracer) else None
         if kind is not None and kind.varying:
@@ -136,7 +136,7 @@ def _refuse_checked_axes(caller: str, *args: PyTree):
 
 
 def require_steps(caller: str, stepper: Stepper, dt: Real, num_steps: int | None, parts: int = 1) -> tuple[Real, int]:
-    """dt, a number or (N,), and the number of steps, each of which may be divided into so many parts."""
+    """dt, a number or (N,), and the number of steps, each of which may be divided into `parts` parts."""
     dt = np.asarray(dt) if isinstance(dt, (list, tuple)) else dt
     if not (is_array(dt) and dt.ndim):
         if num_steps is None:
@@ -170,7 +170,7 @@ def require_steps(caller: str, stepper: Stepper, dt: Real, num_steps: int | None
 
 
 def require_control_alone(caller: str, times: Real, num_steps, save_every: int, extrapolate: int):
-    """An error unless error control comes with times, and with nothing that belongs to steps of given sizes."""
+    """Raises an error unless error control is given times, and no arguments for steps of given sizes."""
     if times is None:
         raise TypeError(f"{caller}: with dt=adaptive(...), give `times`, (K,), at the last of which the run ends.")
     others = ("num_steps", num_steps, None), ("save_every", save_every, 1), ("extrapolate", extrapolate, 1)
@@ -180,7 +180,7 @@ def require_control_alone(caller: str, times: Real, num_steps, save_every: int, 
 
 
 def require_steps_to(caller: str, times: Real, dt: Real, num_steps, save_every: int, t0: Real) -> Real:
-    """dt, of the steps that are read off at `times`."""
+    """dt, for steps between which `times` are interpolated."""
     for name, value, default in (("num_steps", num_steps, None), ("save_every", save_every, 1)):
         if value != default:
             raise ValueError(f"{caller}: with `times`, leave `{name}` out; received {value!r}.")
@@ -195,14 +195,14 @@ def _require_one_size(caller: str, dt: Real, beside: str) -> Real:
     if isinstance(dt, (list, tuple)) or (is_array(dt) and dt.ndim):
         raise NotImplementedError(
             f"{caller}: with `{beside}`, `dt` must be a number or adaptive(...); received {np.shape(dt)}. Leave "
-            f"`{beside}` out, and read the run off by `interpolate`."
+            f"`{beside}` out, and sample the run by `interpolate`."
         )
     require_number(caller, "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
     return float(dt) if is_concrete(dt) else dt
 
 
 def require_one_length(caller: str, duration: Real, num_samples: int | None, **others: int | None):
-    """An error where a run gets its length by `duration`, and by something else too."""
+    """Raises an error if the length of a run is given by `duration` and by another argument too."""
     if duration is None:
         raise TypeError(f"{caller}: `num_samples` goes with `duration`; received {num_samples!r} alone.")
     require_number(caller, "duration", duration, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
@@ -215,12 +215,12 @@ def require_one_length(caller: str, duration: Real, num_samples: int | None, **o
 
 
 def steps_within(caller: str, dtype: np.dtype, dt: Real, duration: Real, num_samples: int | None):
-    """dt, num_steps and save_every, with steps that are made smaller, if need be, to land on equal samples."""
+    """dt, num_steps and save_every, with dt reduced, if necessary, so that steps end on equally spaced samples."""
     dt = _require_one_size(caller, dt, "duration")
     if not all_concrete((dt, duration)):
         raise TypeError(
             f"{caller}: with `duration`, `dt` and `duration` must be known, because the number of steps is part of the "
-            "program: give `num_steps`, or take `sweep`, for which they are data."
+            "program: give `num_steps`, or use `sweep`, for which they are data."
         )
     H = float(duration) / (num_samples or 1)
     if dt > H * (1 + 1e-6):
@@ -234,8 +234,8 @@ def steps_within(caller: str, dtype: np.dtype, dt: Real, duration: Real, num_sam
 
 
 class EqualSteps(NamedTuple):
-    """Steps of one size from t0 on. counts: (K,), how many there are from one of some times to the next, the last of
-    them ending at it or beyond; reached: how far they can be read off."""
+    """Equal steps from t0 on. counts: (K,), the number of steps from one of some times to the next, where the last of
+    them ends at that time or later; reached: the end of the interval that can be interpolated."""
 
     dt: Any
     counts: Array
@@ -243,7 +243,7 @@ class EqualSteps(NamedTuple):
 
     @classmethod
     def to(cls, t0: Array, times: Array, dt: Array) -> EqualSteps:
-        """Those to each of the times; none of a traced size that is not positive."""
+        """The steps to each of the times; none if dt is traced and not positive."""
         fine, eps = (dt > 0) & jnp.isfinite(dt), 8 * float(jnp.finfo(dt.dtype).eps)
         h = jnp.where(fine, dt, 1)
         number = (times - t0) / h
@@ -253,23 +253,23 @@ class EqualSteps(NamedTuple):
         return cls(dt, counts, jnp.where(fine, jnp.inf, t0))
 
     def loop(self, flat: FlatSystem, stepper: Stepper, q: Array, v: Array, t0: Array, params: PyTree) -> Loop:
-        """The `Loop` over them."""
+        """The `Loop` over these steps."""
         return equal_steps(flat, stepper, q, v, t0, params, self.dt)
 
 
 def refined(dt: Real, k: int) -> Real:
-    """k steps in the place of each."""
+    """dt, with each step replaced by k steps."""
     return jnp.repeat(dt / k, k) if np.ndim(dt) else dt / k
 
 
 def warn_of_jumps_to(problem: Problem, dt: Real, times: Real):
-    """The same of equal steps to the last of these times."""
+    """As `warn_of_jumps_in`, for equal steps to the last of these times."""
     if zero_order_hold.holds(problem.params) and all_concrete((dt, times, problem.t0)):
         warn_of_jumps_in(problem, dt, int(np.ceil((float(times[-1]) - float(problem.t0)) / float(dt) - 1e-6)), 5)
 
 
 def warn_of_jumps_in(problem: Problem, dt: Real, num_steps, level: int = 4):
-    """A warning where a held input jumps within one of these steps, as far as all is known."""
+    """Warns if a held input jumps within one of these steps, as far as the values are known."""
     if zero_order_hold.holds(problem.params) and all_concrete((dt, problem.t0)):
         dt, t0 = np.asarray(dt, float), np.asarray(problem.t0, float)
         times = t0 + np.append(0.0, np.cumsum(dt) if dt.ndim else num_steps * dt)
@@ -286,8 +286,9 @@ AT_GUARD = 1e3  # roundings of the terms of a guard that count as zero
 
 
 def require_events(caller: str, problem: Problem, events, step: Real):
-    """The events as a tuple, or an error for what is none, or does not fit the problem. step: the size of the first,
-    of a run under error control what may be; where it is not known, a rate of rounding counts as one."""
+    """The events as a tuple; raises an error if one is not an event, or does not fit the problem. step: the size of the
+    first step, or its limit under error control. If it is not known, a rate at the level of rounding counts as a
+    rate."""
     if isinstance(events, Event) or not isinstance(events, (list, tuple)) or not events:
         raise TypeError(f"{caller}: `events` must be a list of Event(...); received {events!r}.")
     for i, event in enumerate(events):
@@ -295,7 +296,7 @@ def require_events(caller: str, problem: Problem, events, step: Real):
             raise TypeError(f"{caller}: `events[{i}]` must be an Event(...); received {event!r}.")
     if not problem.stepper.meets_events:
         raise NotImplementedError(
-            f"{caller}: {problem.stepper.name} cannot begin anew behind an event; use hht() or another of "
+            f"{caller}: {problem.stepper.name} does not support events; use hht() or another of "
             "its family, a Rosenbrock method such as rodas5p(), rk4() or dopri5()."
         )
     require_masses(caller, problem.system, "leave out `events`")
@@ -312,9 +313,10 @@ def require_events(caller: str, problem: Problem, events, step: Real):
 
 
 def refused_members(problem_of: Callable, arrays: list, axes: list, events, steps):
-    """Numbers of those members of a batch that `require_events` refuses for their values, as far as these are known.
+    """Indices of the members of a batch that `require_events` rejects for their values, as far as these are known.
 
-    problem_of: arrays -> a member's `Problem`; axes: of the arrays, as for `jax.vmap`; steps: as there, of each member.
+    problem_of: arrays -> a member's `Problem`; axes: of the arrays, as for `jax.vmap`; steps: the `step` of each
+    member.
     """
 
     def of_all(f):
@@ -334,12 +336,12 @@ def refused_members(problem_of: Callable, arrays: list, axes: list, events, step
 
 
 def _known_step(step: Real):
-    """A step, or those of all members, (B, 1); 0 where it is not known."""
+    """A step, or the steps of all members, (B, 1); 0 if unknown."""
     return np.asarray(step)[..., None] if is_concrete(step) else 0.0
 
 
 def _require_shapes(caller: str, problem: Problem, event):
-    """An error for a guard that is no number, and for what a reset or a switch returns."""
+    """Raises an error for a guard that does not return a number, and for wrong results of a reset or a switch."""
     params, first_order = thaw(problem.params), isinstance(problem.system, FirstOrderSystem)
     if event.at is not None:
         _require_known_times(caller, params, event)
@@ -367,7 +369,7 @@ def _require_shapes(caller: str, problem: Problem, event):
 
 
 def _require_known_times(caller: str, params: PyTree, event: Event):
-    """An error for known times that are none."""
+    """Raises an error for wrong known times."""
     if not callable(event.at):
         return
     times = checks.evaluate(caller, "at", event.at, params)
@@ -379,18 +381,18 @@ def _require_known_times(caller: str, params: PyTree, event: Event):
 
 
 def _with_multipliers(caller: str, problem: Problem, event):
-    """The guard as a function without multipliers, which it may see."""
+    """The guard as a function that gets no multipliers argument; a guard that needs it receives the multipliers."""
     if not event.sees_multipliers:
         return event.guard
     system = problem.system
     if system.constraint is None:
-        raise ValueError(f"{caller}: the `guard` asks for `multipliers`, and the system has no constraint.")
+        raise ValueError(f"{caller}: the `guard` has an argument `multipliers`, but the system has no constraint.")
     if isinstance(event.reset, Impact):
         raise ValueError(f"{caller}: the `guard` of an impact must depend on q and t only, not on multipliers.")
     if problem.stepper.options.formulation == "index3":
         raise NotImplementedError(
-            f'{caller}: the `guard` asks for `multipliers`, and with formulation="index3" those of a step that is '
-            "divided are of order 0: leave `formulation` out."
+            f'{caller}: the `guard` has an argument `multipliers`, and with formulation="index3" the multipliers of a '
+            "divided step have order 0: leave `formulation` out."
         )
     at = problem.q0, problem.t0, thaw(problem.params)
     m, dtype = (
@@ -401,7 +403,7 @@ def _with_multipliers(caller: str, problem: Problem, event):
 
 
 def _require_impact(caller: str, params: PyTree, law: Impact, first_order: bool):
-    """An error for an impact that has no velocity to change, or no restitution."""
+    """Raises an error for an impact without a velocity to change, or without a restitution."""
     if first_order:
         raise TypeError(
             f"{caller}: an impact needs velocities, and a FirstOrderSystem has none: give reset(y, t, params)."
@@ -414,7 +416,7 @@ def _require_impact(caller: str, params: PyTree, law: Impact, first_order: bool)
 
 
 def _require_same(caller: str, params: PyTree, after: dict):
-    """An error for params that a switch has given another form."""
+    """Raises an error for params whose structure, shapes or dtypes a switch has changed."""
     before = freeze(params)
     if jax.tree.structure(before) != jax.tree.structure(after):
         raise TypeError(
@@ -429,8 +431,8 @@ def _require_same(caller: str, params: PyTree, after: dict):
 
 
 class Start(NamedTuple):
-    """What is known of all guards where a run starts: g and dg/dt, what g is the sum of, whether it depends on v, the
-    restitution, 0 without, and d2g/dt2, where that was asked for."""
+    """The values of all guards at the start of a run: g and dg/dt, the size of the terms of g, whether g depends on v,
+    the restitution (0 without), and d2g/dt2 if requested."""
 
     g: Any
     rate: Any
@@ -440,27 +442,27 @@ class Start(NamedTuple):
     second: Real = 0.0
 
     def is_at_guard(self, events: tuple) -> np.ndarray:
-        """Of each event, whether its guard is zero but for rounding: (..., E)."""
+        """For each event, whether its guard is zero up to rounding: (..., E)."""
         numbers = np.finfo(self.g.dtype)
         zero = np.abs(self.g) <= AT_GUARD * numbers.eps * np.maximum(self.terms, numbers.tiny)
         return zero & _is_guarded(events)
 
     def is_beyond(self, events: tuple, step) -> np.ndarray:
-        """Whether the start is beyond its guard, or at it and not leaving: (..., E). Of a motion that is back at its
-        guard within a rounding of a step the acceleration tells."""
+        """Whether the start is beyond its guard, or at it and not leaving: (..., E). If the motion would return to the
+        guard within a rounding of a step, the acceleration decides."""
         soon = nearness(self.g) * step * np.abs(self.second)
         leaves = np.where(np.abs(self.rate) <= soon, np.greater(self.second, 0), self.rate > 0)
         return _is_guarded(events) & ~(self.g > 0) & ~(self.is_at_guard(events) & leaves)
 
 
 def _is_guarded(events: tuple) -> np.ndarray:
-    """Whether an event has a guard that a motion must not be beyond."""
+    """Whether an event has a guard that the start must not violate."""
     return np.array([not event.is_noted and event.guard is not None for event in events])
 
 
 @Programs
 def _guards_at_start(problem: Problem, events: tuple):
-    """What `Start` tells, but for d2g/dt2."""
+    """The `Start`, without d2g/dt2."""
     flat, q, v, t0, params = problem.flat()
     flat_events = flatten_events(flat, events, params, (q, v, t0), problem.stepper.redundant)
     start, over = _begun(problem, flat, q, v, t0, params), flat_events.before_any(t0)
@@ -510,7 +512,7 @@ def _begun(problem: Problem, flat: FlatSystem, q: Array, v: Array, t: Array, par
 
 
 def _require_start(caller: str, events: tuple, start: Start, step):
-    """An error for a start beyond a guard, and an impact along a velocity."""
+    """Raises an error for a start beyond a guard, and for an impact whose guard depends on v."""
     beyond, at_guard = start.is_beyond(events, step), start.is_at_guard(events)
     for i, event in enumerate(events):
         if isinstance(event.reset, Impact) and start.on_velocity[i]:
@@ -528,12 +530,12 @@ def _require_start(caller: str, events: tuple, start: Start, step):
 
 
 def equal_times(t0, duration, num_samples):
-    """The times of so many samples at equal distances."""
+    """The times of `num_samples` equally spaced samples."""
     return t0 + duration * np.arange(1, num_samples + 1) / num_samples
 
 
 def require_sample_times(times: PyTree, t0: Real, dtype: np.dtype, caller: str = "sweep") -> Real:
-    """times (K,) in the dtype of the state, in which they must increase, checked as far as they are known."""
+    """times (K,) in the dtype of the state, in which they must increase; checked as far as they are known."""
     times = times if is_array(times) else np.asarray(times)
     if not is_real(times):
         raise TypeError(f"{caller}: `times` must be real numbers; received {times!r}.")

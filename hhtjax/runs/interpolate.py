@@ -1,4 +1,4 @@
-"""Dense output: what a run does between its saved times."""
+"""`interpolate`: dense output, the values of a run between its saved times."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ if TYPE_CHECKING:
 
 @shown
 class Interpolant(NamedTuple):
-    """A run between its saved times; made by `interpolate`. All have the times asked for as leading axes.
+    """Values of a run between its saved times; made by `interpolate`. The axes of the requested times come first.
 
     Attributes:
-        q, v: position and velocity; of a first-order system y and None.
-        acceleration: that of v; None of a first-order system.
-        multipliers: L, None without constraints.
-        z, zdot: internal states and their rates, None without.
-        friction, sticking: dry friction, and whether a joint sticks, None without.
-        output: what the run has in the place of all these, None without.
-        contact: `ContactForces`, None without.
+        q, v: position and velocity; for a first-order system y and None.
+        acceleration: the rate of v; None for a first-order system.
+        multipliers: L; None without constraints.
+        z, zdot: internal states and their rates; None without internal states.
+        friction, sticking: dry friction, and whether a joint sticks; None without dry friction.
+        output: the output of a run with `output=`, which has none of the other values; else None.
+        contact: `ContactForces`; None without contacts.
     """
 
     q: PyTree
@@ -54,37 +54,38 @@ class Interpolant(NamedTuple):
 
 
 def interpolate(solution: Solution, times: Real | None) -> Interpolant:
-    """Dense output: what a run has saved, at arbitrary times inside the run, differentiable in all.
+    """Dense output: the values of a run at arbitrary times inside it, differentiable in all arguments.
 
-    Cubic Hermite polynomials between the saved times: q through (q, v), v through (v, acceleration), internal states
-    through (z, zdot); for a rotation, of the rotation vector from the saved one before. Their error is O(H^4), H the
-    spacing of the saved times. The acceleration, and zdot, are the rates of these cubics, with O(H^3); multipliers and
-    dry friction are straight lines, with O(H^2), the friction of a joint that begins to slide, or to stick, the nearer
-    of the two that are saved. Of a run with `output=` straight lines join its outputs, numbers as they are: give such a
-    run the times, `simulate(..., times=, output=)`, where O(H^2) is too much.
+    Between saved times it uses cubic Hermite polynomials: q from (q, v), v from (v, acceleration), internal states from
+    (z, zdot). For a rotation it interpolates the rotation vector relative to the previous saved rotation. The error is
+    O(H^4), where H is the spacing of the saved times. The acceleration, and zdot, are the derivatives of these cubics,
+    with O(H^3). Multipliers and dry friction are interpolated linearly, with O(H^2). For a joint that begins to slide
+    or to stick, the friction is that of the nearer saved time. Outputs of a run with `output=` are interpolated
+    linearly, number by number. If O(H^2) is not accurate enough, give the times to the run:
+    `simulate(..., times=, output=)`.
 
-    Forces of contacts are straight lines where nobody switches, else the nearer ones. Where a contact has landed in
-    between, all is of order 1: give such a run the times, too.
+    Contact forces are interpolated linearly if no contact switches in between; otherwise they are those of the nearer
+    saved time. If a contact has landed in between, all values have order 1: give such a run the times, too.
 
-    Where events lie between two saved times, the polynomials end there: q with O(H^4), v and z (and y of a first-order
-    system) straight lines with O(H^2), their rates constant; at the event itself v is that behind it. Multipliers and
-    friction are those saved on the same side, and NaN between two events. All is NaN
-    behind the last of `keep_events`, if there were more. Where a held input jumps at a saved time, what is known there
-    is what was before the jump.
+    If events lie between two saved times, the polynomials end there: q with O(H^4); v and z (and y of a first-order
+    system) linear with O(H^2), and their rates constant. At the event itself v is the value after it. Multipliers and
+    friction are those saved on the same side of the event, and NaN between two events. If there were more events than
+    `keep_events`, everything after the last kept one is NaN. If a held input jumps at a saved time, the values at that
+    time are those before the jump.
 
     Args:
-        solution: of one run (vmap this function for a batch).
+        solution: a single run (use vmap for a batch).
         times: scalar or array, inside [solution.t[0], solution.t[-1]] up to rounding.
 
     Returns:
         An `Interpolant`.
 
-    A run that failed is told again, by a `FailedRunWarning`.
+    For a failed run the `FailedRunWarning` is repeated.
 
     Raises:
-        TypeError, ValueError: times that are not real; a solution of several runs; a time outside the run, where the
-            result is NaN for tracers.
-        NotImplementedError: a run with events and `output=`, of which nothing is known at its events.
+        TypeError, ValueError: times that are not real; a solution of several runs; a time outside the run (for tracers
+            the result is NaN instead).
+        NotImplementedError: a run with events and `output=`, whose output at the events is unknown.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> ball = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: 0 * q - 9.81)
@@ -102,7 +103,7 @@ def interpolate(solution: Solution, times: Real | None) -> Interpolant:
     told("interpolate: of a run that failed", solution, throw=False)
     if solution.output is not None and solution.events is not None:
         raise NotImplementedError(
-            "interpolate: nothing is known of the output of a run at its events: give `times` to simulate."
+            "interpolate: the output of a run with events is unknown at its events: give `times` to simulate."
         )
     known = solution._replace(dt=None, info=None, failure=None, error=None, steps=None, allowed=None)
     equal = not jnp.ndim(solution.dt) and solution.events is None  # an event may end a run early
@@ -116,7 +117,8 @@ def interpolate(solution: Solution, times: Real | None) -> Interpolant:
 
 
 def _are_uneven(t) -> Real:
-    """Whether saved times are at other distances than those of a run, beside rounding: of rows picked out."""
+    """Whether the saved times have other spacings than those of a run, apart from rounding, as when rows were
+    selected."""
     xp = np if is_concrete(t) else jnp
     t = xp.asarray(t)
     mean, rounding = (t[-1] - t[0]) / max(len(t) - 1, 1), 4 * float(np.finfo(t.dtype).eps) * xp.max(xp.abs(t))
@@ -125,8 +127,8 @@ def _are_uneven(t) -> Real:
 
 @partial(Programs, static_argnames="equal")
 def _found(known: Solution, times: Array, equal: bool | None):
-    """What is saved of a run, at the times, and which of them lie outside of it; equal: whether its intervals are, None
-    where that is known when the program runs."""
+    """The values of a run at the times, and which times lie outside of it. equal: whether its intervals are equal, None
+    if this is known only at run time."""
     t, times = known.t, times.astype(known.t.dtype)
     start, end = t[0], t[-1]
     slack = 16 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(start), jnp.abs(end))
@@ -154,12 +156,12 @@ def _found(known: Solution, times: Array, equal: bool | None):
 
 
 def on_axes(x, y: Array) -> Array:
-    """x with as many axes as y, whose leading ones it has."""
+    """x with as many axes as y; x has the leading axes of y."""
     return x.reshape(x.shape + (1,) * (y.ndim - x.ndim))
 
 
 def between_events(events, a, b, H, x, times):
-    """What `between` takes, with the events that lie between a and b for ends."""
+    """The arguments of `between`, with the events between a and b as additional end points."""
     t = jnp.where(jnp.isnan(events.t), jnp.inf, events.t)
     last = jnp.searchsorted(t, times, side="right") - 1
     earlier, later = jnp.maximum(last, 0), jnp.minimum(last + 1, t.size - 1)
@@ -183,7 +185,7 @@ def between_events(events, a, b, H, x, times):
         return jnp.where(on_axes(inside, rate), (y1 - y0) / on_axes(jnp.where(H > 0, H, 1), rate), rate)
 
     def on_the_same_side(before, after):
-        """Of what jumps at events: what is saved on this side of them."""
+        """For values that jump at events: the saved value on this side of them."""
         value = jnp.where(on_axes(inside & ahead, before), before, after)
         if before.dtype == bool:
             return value
@@ -208,9 +210,10 @@ def between_events(events, a, b, H, x, times):
 
 
 def between(a: Solution, b: Solution, H: Array, x: Array) -> Solution:
-    """The saved values between those of a and b, which are H apart, at the part x of it, 0 to 1; any leading axes.
+    """The values between the saved values a and b, which are H apart, at the fraction x of the interval, 0 to 1; any
+    leading axes.
 
-    Rates are those of the polynomials where nothing else is known; multipliers, friction and outputs are linear.
+    Rates are those of the polynomials unless others are known. Multipliers, friction and outputs are linear.
     """
 
     def hermite(y0: PyTree, y1: Array, slope0: Array, slope1: Array) -> Array:
@@ -269,7 +272,7 @@ TINY = 1e-9  # part of a run
 
 
 def kept(flat: FlatSystem, stepper: Stepper, state: State):
-    """What is saved of a state, and what its dense output adds."""
+    """The values saved of a state, and the additional terms of its dense output."""
     extra = None
     if stepper.reads_series:
         return saved(flat, state), state.memory
@@ -282,8 +285,8 @@ def kept(flat: FlatSystem, stepper: Stepper, state: State):
 def solution_at(
     flat: FlatSystem, start: State, around: tuple | None, times: Array, reached: Array, info: Info, failure: Failure
 ) -> Solution:
-    """The `Solution` at the times, each between the two states of which `around` has what `kept` makes of them; NaN
-    beyond what was reached, and before them. Without, one that knows the times."""
+    """The `Solution` at the times, each between two states, from which `kept` has extracted the values in `around`. NaN
+    beyond `reached` and before the states. Without `around`, a solution that only has the times."""
     if around is None:
         nothing: Any = None
         t = jnp.concatenate([start.t[None], times])
@@ -311,7 +314,8 @@ def read_between(
 
 
 def with_dense_term(flat, found, extra: tuple, s: Array, H: Array) -> Solution:
-    """`found`, with s^2 (1 - s)^2 sum_k s^k e_k, what the stepper's dense output adds to cubics, and the rate of that.
+    """`found` plus s^2 (1 - s)^2 sum_k s^k e_k, the correction of the stepper's dense output to the cubics, and its
+    rate.
 
     extra: e of q, v and z, each (number of times, number of terms, number of entries) or None."""
     e_q, e_v, e_z = extra
@@ -332,7 +336,7 @@ def with_dense_term(flat, found, extra: tuple, s: Array, H: Array) -> Solution:
 
 
 def by_series(flat: FlatSystem, a: Solution, found: Solution, series: Expansion, h: Array) -> Solution:
-    """`found`, with what is h behind a by the series from there on."""
+    """`found`, with the values at h after a evaluated by the Taylor series from a."""
 
     def at(series: Expansion, h: Array):
         q, v, w = summed(series, h)
@@ -347,7 +351,8 @@ def by_series(flat: FlatSystem, a: Solution, found: Solution, series: Expansion,
 
 
 def output_between(flat: FlatSystem, output: Output, params: PyTree, pair: tuple, time: Array, long) -> PyTree:
-    """What `output` gives at a time between a pair of what `kept` has made of states; long: of `read_between`."""
+    """The value of `output` at a time between two states, from what `kept` extracted of these; long: see
+    `read_between`."""
     (a, _), (b, extra) = jax.tree.map(lambda x: x[None], pair)
     a, b, times = as_path(flat, a), as_path(flat, b), time[None]
     found = read_between(flat, a, b, extra, times, times, long)
@@ -357,7 +362,7 @@ def output_between(flat: FlatSystem, output: Output, params: PyTree, pair: tuple
 
 
 def with_output(run: Solution, start: PyTree, found: PyTree, times: Array, reached: Array) -> Solution:
-    """The `Solution` with the output at its start and at the times; NaN beyond what was reached."""
+    """The `Solution` with the output at its start and at the times; NaN beyond `reached`."""
 
     def joined(x: Array, y: Array) -> Array:
         if jnp.issubdtype(y.dtype, jnp.floating):

@@ -1,4 +1,4 @@
-"""What a sweep has left on disk, all of it or as arrays that stay there."""
+"""`load_sweep`: reads what a sweep has written to disk, completely or on demand."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from hhtjax.runs.zarr_store import zarr_arrays
 
 
 def load_sweep(folder: str | Path, *, lazy: bool = False) -> dict[str, Any]:
-    """What `sweep_to_disk` or `map_to_disk` wrote: arrays by name, members first.
+    """The arrays that `sweep_to_disk` or `map_to_disk` wrote, by name, with members first.
 
     Args:
-        folder: where it was written to.
-        lazy: arrays that stay on disk, for what is larger than memory: `x[10:20]` reads the files of these members,
+        folder: the folder that was written.
+        lazy: whether arrays stay on disk, for results larger than memory: `x[10:20]` reads the files of these members,
             `numpy.asarray(x)` all of them.
 
     Returns:
-        Arrays by name, of a sweep the leaves of the `Solution`: "t", "q", "v", "dt", "failure.step", ...; their first
-        axis is that of the members. What is of another length in each chunk, such as the steps of `adaptive`, ends with
-        NaN.
+        Arrays by name; for a sweep the leaves of the `Solution`: "t", "q", "v", "dt", "failure.step", ... Their first
+        axis counts the members. Arrays whose length differs between chunks, such as the steps of `adaptive`, are padded
+        with NaN.
 
     Raises:
-        FileNotFoundError: the folder holds no sweep, or a chunk is missing, because the sweep is not finished.
-        ValueError: a file is damaged, or is another chunk's.
+        FileNotFoundError: the folder holds no sweep, or a chunk is missing because the sweep is not finished.
+        ValueError: a file is damaged, or belongs to another chunk.
 
     >>> import hhtjax
     >>> hhtjax.load_sweep("no such folder")  # doctest: +IGNORE_EXCEPTION_DETAIL
@@ -43,13 +43,13 @@ def load_sweep(folder: str | Path, *, lazy: bool = False) -> dict[str, Any]:
     if manifest is None:
         raise FileNotFoundError(f"load_sweep: `folder` must hold a sweep; received {folder}, without a {MANIFEST}.")
     if not all(isinstance(manifest.get(key), int) for key in ("chunks", "chunk", "members")):
-        raise ValueError(f"load_sweep: {folder / MANIFEST} is damaged: make the sweep anew in another folder.")
+        raise ValueError(f"load_sweep: {folder / MANIFEST} is damaged: run the sweep again in another folder.")
     files = _Files(folder, manifest)
     missing = [path.name for path in files.paths if not path.exists()]
     if missing:
         raise FileNotFoundError(
             f"load_sweep: {len(missing)} of {len(files.paths)} chunks are missing in {folder}, the first is "
-            f"{missing[0]}: repeat the call that wrote it, which goes on where it stopped."
+            f"{missing[0]}: repeat the call that wrote it, which continues where it stopped."
         )
     return files.arrays() if lazy else files.all()
 
@@ -62,17 +62,17 @@ class _Files:
         self.paths = [folder / f"chunk-{k:05d}.npz" for k in range(manifest.get("chunks") or 0)]
 
     def read(self, k: int, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-        """The arrays of these names of a chunk."""
+        """The arrays of a chunk with these names."""
         path = self.paths[k]
         try:
             with open(path, "rb") as file, np.load(file) as part:
                 if not is_chunk(part, k, self.manifest.get("inputs")):
-                    raise ValueError("another chunk's, or another sweep's")
+                    raise ValueError("it belongs to another chunk or another sweep")
                 wanted = [name for name in part.files if name not in (NUMBER, INPUTS)] if names is None else names
                 return {name: part[name] for name in wanted}
         except (ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
             raise ValueError(
-                f"load_sweep: {path} is damaged ({error}): repeat the call that wrote it, which makes it anew."
+                f"load_sweep: {path} is damaged ({error}): repeat the call that wrote it, which writes the file again."
             ) from error
 
     def all(self) -> dict[str, np.ndarray]:
@@ -87,17 +87,17 @@ class _Files:
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def arrays(self) -> dict[str, StoredArray]:
-        """All of them."""
+        """The arrays of all members."""
         first = self.read(0)
         ragged = self.manifest.get("shortened") or ()
         return {name: StoredArray(self, name, x.shape[1:], x.dtype, name in ragged) for name, x in first.items()}
 
 
 class StoredArray:
-    """An array in the files of a sweep: `x[3]`, `x[10:20]`, `numpy.asarray(x)`, each read when it is asked for.
+    """An array in the files of a sweep: `x[3]`, `x[10:20]`, `numpy.asarray(x)` read it on demand.
 
     Attributes:
-        shape, dtype, ndim: as of an array of NumPy; the first axis is that of the members.
+        shape, dtype, ndim: as for an array of NumPy; the first axis counts the members.
     """
 
     def __init__(self, files: _Files, name: str, row: tuple[int, ...], dtype: np.dtype, is_ragged: bool):

@@ -1,4 +1,4 @@
-"""What a run gives in place of its path: a user's function of the motion, such as the readings of sensors."""
+"""The output of a run instead of its path: a user's function of the motion, such as the readings of sensors."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class Output(Description):
     """A function of the motion; made by `require_output`.
 
     Attributes:
-        function: the user's.
-        names: of what it is called with.
-        beside_path: whether a run saves q and v too.
+        function: the user's function.
+        names: the names of its arguments.
+        beside_path: whether the run saves q and v too.
     """
 
     function: Any
@@ -61,7 +61,7 @@ class Output(Description):
 
 
 def require_output(caller: str, function):
-    """The `Output` of a user's function; None of None; an error that names what it must be."""
+    """The `Output` of a user's function; None for None; raises an error that says what it must be."""
     if function is None or isinstance(function, Output):
         return function
     require_function(caller, "output", function, "output(...)")
@@ -69,7 +69,7 @@ def require_output(caller: str, function):
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
-        raise TypeError(f"{wanted}; received {function!r}, which does not tell its arguments.") from None
+        raise TypeError(f"{wanted}; received {function!r}, whose arguments are unknown.") from None
     filled = function.keywords if isinstance(function, partial) else {}
     for x in parameters:
         optional = x.default is not x.empty or x.kind is x.VAR_KEYWORD
@@ -95,7 +95,7 @@ def _as_array(x: Array, dtype: np.dtype) -> Array:
 
 
 def output_of(output: Output, flat, params: PyTree, state) -> PyTree:
-    """What `output` gives at a state on vectors."""
+    """The value of `output` at a state on vectors."""
     state = public(flat, state)
     values = {"t": state.t, "params": params, "L": state.L, "w": None, "z": None, "zdot": None}
     values |= {"friction": None, "sticking": None, "contact": None}
@@ -112,12 +112,12 @@ def output_of(output: Output, flat, params: PyTree, state) -> PyTree:
 
 
 def output_at_start(flat: FlatSystem, output: Output, params: PyTree, start: State, h: Array) -> PyTree:
-    """The same where a run starts, with a step h."""
+    """The value of `output` at the start of a run, with a step h."""
     return output_of(output, flat, zero_order_hold.before(params, start.t, h), start)
 
 
 def output_at(output: Output, found: Interpolant | Solution, t: Array, params: PyTree) -> PyTree:
-    """The same of anything with the attributes of a `Solution`, at one time."""
+    """The value of `output` for anything with the attributes of a `Solution`, at one time."""
     names = {"w": "acceleration", "L": "multipliers"}
     values = {name: getattr(found, names.get(name, name)) for name in NAMES if name not in ("t", "params")}
     return output(values | {"t": t, "params": params}, t.dtype)
@@ -127,19 +127,21 @@ PATH = ("q", "v", "acceleration", "multipliers", "z", "zdot", "friction", "stick
 
 
 def beside_path(output, control: Adaptive):
-    """The `Output` of a run under error control: whoever states errors compares q, and drops the path in the end."""
+    """The `Output` of a run under error control. If errors are reported, the run also keeps q for comparison, and drops
+    it at the end."""
     return output if output is None or not control.verify else replace(output, beside_path=True)
 
 
 def without_path(run):
-    """A `Solution` of which the output is left."""
+    """A `Solution` with only the output."""
     return run._replace(**dict.fromkeys(PATH))
 
 
 def savings(run: Run):
-    """How a `Run` saves: the function carry -> what is kept, and that of all kept, dt, info, failure -> `Solution`.
+    """How a `Run` saves: the function carry -> saved values, and the function from all saved values, dt, info and
+    failure to the `Solution`.
 
-    The first takes the size of the step that has led there, too, where the loop does not know it.
+    The first also takes the size of the step that has ended, if the loop does not know it.
     """
     problem, flat, params, loop, form = run
     output = problem.output
@@ -163,9 +165,9 @@ def savings(run: Run):
 
 
 def require_path(caller: str, run: Solution):
-    """An error for a run that has kept outputs alone."""
+    """Raises an error for a run that saved only its output."""
     if getattr(run, "q", None) is None and getattr(run, "output", None) is not None:
         raise ValueError(
-            f"{caller}: `solution` must have q and v; received a run with output=, which keeps nothing else: leave it "
+            f"{caller}: `solution` must have q and v; received a run with output=, which saves nothing else: leave it "
             "out, or let the output return q and v too."
         )

@@ -29,31 +29,32 @@ def parallel_map(
 ) -> PyTree:
     """`jax.vmap(f)(*arguments)`, `chunk` members at a time, by the workers of an executor.
 
-    What crosses is the compiled function's program (`jax.export`), the arrays that members share, and those of a chunk.
-    So f may be defined anywhere, a notebook included; workers need hhtjax and the same JAX, and compile once each. The
-    values are those of the same call without an executor, bit by bit, for one `chunk` and on processors of one kind.
+    Workers receive the compiled function's program (`jax.export`), the arrays that members share, and those of a chunk.
+    So f may be defined anywhere, also in a notebook. Workers need hhtjax and the same version of JAX, and each compiles
+    once. With the same `chunk` and processors of one kind, the values are the same as without an executor, bit by bit.
 
     Args:
-        f: a function of one member's arguments, which JAX can trace; any pytree of arrays comes back. Host callbacks
-            cannot cross: progress=True inside f, and sparse systems, whose equations SciPy solves.
-        arguments: pytrees of arrays with a leading axis, that of the members; keys of `jax.random` too.
+        f: a function of one member's arguments, which JAX can trace; it returns any pytree of arrays. Host callbacks do
+            not work on workers: progress=True inside f, and sparse systems, whose equations SciPy solves.
+        arguments: pytrees of arrays whose leading axis counts the members; keys of `jax.random` too.
         executor: any `concurrent.futures.Executor`: `ProcessPoolExecutor` with
             mp_context=multiprocessing.get_context("spawn"), Dask's `client.get_executor()`, `MPIPoolExecutor` of
-            mpi4py. None: this process does it.
-        chunk: members in a task, at most. Choose seconds of work for each, since to hand one out takes a millisecond.
-        in_axes: for each argument, or for branches of it, 0, or None where members share it.
-        in_flight: tasks handed out and not yet returned, at most; take twice as many as there are workers.
-        retries: how often a task that failed is tried again.
-        progress: a bar in one line on stderr.
+            mpi4py. None: this process.
+        chunk: largest number of members in a task. Choose it so that a task takes seconds, since submitting one takes a
+            millisecond.
+        in_axes: for each argument, or for its branches: 0, or None if members share it.
+        in_flight: largest number of tasks submitted and not yet finished; use twice the number of workers.
+        retries: how often a failed task is tried again.
+        progress: shows a progress bar in one line on stderr.
 
     Returns:
-        What f returns, in arrays of NumPy with the axis of members in front.
+        The results of f, as arrays of NumPy with the axis of members in front.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind; leading axes of unequal lengths; tracers.
         NotImplementedError: f calls back to Python, and there is an executor.
-        RuntimeError: members failed, whose numbers and last error are told; or a worker died, and its executor with it.
-            Nothing of the others is kept: `map_to_disk` keeps it.
+        RuntimeError: members failed (the message has their numbers and the last error), or a worker died, which breaks
+            its executor. All results are lost then; `map_to_disk` keeps them.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> from concurrent.futures import ThreadPoolExecutor
@@ -72,21 +73,21 @@ def parallel_map(
 
 
 def work_of(caller: str, f: Callable, arguments: tuple, in_axes: Any, chunk: int) -> Work:
-    """The `Work` of a function of members, or an error for what it is to be called with."""
+    """The `Work` of a function of members; raises errors for wrong arguments."""
     if not callable(f):
         raise TypeError(f"{caller}: `f` must be a function of one member's arguments; received {f!r}.")
     try:
         hash(f)
     except TypeError:
         raise TypeError(
-            f"{caller}: `f` must be hashable; received {type(f).__name__}. Pass what it holds as an argument, with "
+            f"{caller}: `f` must be hashable; received {type(f).__name__}. Pass its data as an argument, with "
             "None in `in_axes`."
         ) from None
     chunk = require_integer(caller, "chunk", chunk)
     if not arguments:
-        raise TypeError(f"{caller}: give `arguments` behind `f`, arrays with a leading axis; received none.")
+        raise TypeError(f"{caller}: give `arguments` after `f`, arrays with a leading axis; received none.")
     if not all_concrete(arguments):
-        raise TypeError(f"{caller}: all arguments must be known: call it outside jit, vmap and grad.")
+        raise TypeError(f"{caller}: arguments must not be tracers: call it outside jit, vmap and grad.")
     leaves, structure = jax.tree.flatten(arguments)
     for x in leaves:
         if not (is_real(x) or (is_array(x) and (_is_key(x) or x.dtype.kind in "biufc"))):
@@ -111,9 +112,9 @@ def work_of(caller: str, f: Callable, arguments: tuple, in_axes: Any, chunk: int
 
 @dataclass(frozen=True)
 class _Mapped:
-    """f over members, as a function of the arrays that they share, and of their own.
+    """f over members, as a function of the arrays that they share, and of the arrays of each.
 
-    kinds: of keys of `jax.random`, which cross as numbers; None of all else."""
+    kinds: the types of keys of `jax.random`, which are sent as numbers; None for other leaves."""
 
     f: Callable
     structure: Any

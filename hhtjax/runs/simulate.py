@@ -1,4 +1,4 @@
-"""A run: one scan over the steps."""
+"""`simulate`: one run, as one scan over its steps."""
 
 from __future__ import annotations
 
@@ -75,77 +75,83 @@ def simulate(
     throw: bool = False,
     output: Callable | None = None,
 ) -> Solution:
-    """Steps `system` from (q0, v0) at t0, with internal states from (q0, v0, z0), num_steps times by dt.
+    """Simulates `system` from (q0, v0) at t0, with internal states from (q0, v0, z0), in num_steps steps of size dt.
 
     Args:
         system: a `System`, `LinearSystem` or `FirstOrderSystem`.
         stepper: `hht()`, `rk4()`, ...
-        q0, v0: position and velocity, pytrees of the same structure; float32 or float64, integers become
-            the default float type. A `FirstOrderSystem` has y0 in the place of q0, and no v0.
-        params: any pytree, handed to the functions of the system. Its arrays and numbers are data. Functions in it,
-            such as the activations of a neural network in an `equinox.Module`, are part of the program, and told apart
-            by identity: a new module of the same structure costs no compilation, a new lambda does.
-        z0: internal states of a `System(..., internal=)`, any pytree of arrays.
-        dt: step size, positive; or (N,), the sizes of N steps, whatever they are, and `num_steps` is left out.
-            The `hht` family keeps its order 2 (with index 3 not in the multipliers), and a `LinearSystem` is factorised
-            anew in each step. A step more than twice as long as the one before can make rho_inf near 0 unstable.
-            Or `adaptive(rtol, atol)`, steps that are chosen by their errors, and constant to derivatives.
+        q0, v0: initial position and velocity, pytrees of the same structure; float32 or float64, integers become the
+            default float type. For a `FirstOrderSystem` pass y0 as q0, and no v0.
+        params: any pytree; it is passed to the functions of the system. Its arrays and numbers are data. Functions in
+            it, such as the activations of a neural network in an `equinox.Module`, are part of the program and are
+            compared by identity. So a new module of the same structure costs no compilation, but a new lambda does.
+        z0: initial internal states of a `System(..., internal=)`, any pytree of arrays.
+        dt: step size, positive. Or (N,), the sizes of N steps, in any order; then leave out `num_steps`. With unequal
+            steps the `hht` family keeps order 2 (except for the multipliers of index 3), and a `LinearSystem` is
+            factorised anew in each step. A step more than twice as long as the previous one can make rho_inf near 0
+            unstable. Or `adaptive(rtol, atol)`, which chooses the steps by their errors; derivatives treat these steps
+            as constants.
         num_steps: number of steps.
-        duration: in the place of num_steps, as in a sweep: dt is made smaller, if need be, so that a whole number of
-            steps is as long, which is reported as `run.dt`. Both are part of the program then; or, with `adaptive`,
-            data.
-        num_samples: K, with `duration`: the number of samples after the start, at equal distances, each at the end of
-            a step (with `adaptive` between two). Default: every step is saved.
-        times: (K,), in the place of num_steps: increasing, after t0, data. The run goes on to the last, and is read off
-            at all of them, by cubics between its steps (multipliers and dry friction by lines): the steps stay what
-            they are, a number dt or `adaptive`, and end at none of the times. (In `sweep` with step sizes they do.)
-        save_every: steps between saved times; a divisor of num_steps. save_every=num_steps keeps the
-            start and the end only, and stores no path.
-        progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
-        extrapolate: number of runs, with steps of dt, dt/2, dt/4, ..., that Richardson's extrapolation joins at the
-            same saved times, 1 to 4. For a stepper of order p, 2 takes the error dt^p out, for three times the work, 3
-            dt^(p + 1) too, for seven times: `hht` becomes of order 3 and 4 (alpha = 0 of order 4 with 2 already, but
-            of order 3 with rotations, unless kinematics="lie"; with uneven steps only alpha = 0, of order 3). For
-            motions that dt resolves, elsewhere it makes errors larger; and for smooth steps, such as
-            linearize="predictor": where "auto" changes its choice, dt^3 is left, as it is where an event, or a switch
-            of dry friction, falls into a step; `friction` and `sticking` are then those of the run with the shortest
-            steps, as is all at a saved time that an event comes before in some runs only.
+        duration: length of the run, instead of num_steps. dt is reduced, if necessary, so that a whole number of steps
+            fits; `run.dt` is the size used. The number of steps is then part of the program, so dt and duration cannot
+            be traced. With `adaptive` the duration is data.
+        num_samples: K, with `duration`: the number of equally spaced samples after the start. Each is at the end of a
+            step (with `adaptive` it may be within one). Default: every step is saved.
+        times: (K,), sample times, instead of num_steps: increasing, after t0, data. The run continues to the last of
+            them. Samples are interpolated between steps, by cubics (multipliers and dry friction linearly), so steps
+            need not end at the times: dt is a number or `adaptive`, and the steps are the same as without `times`.
+            (With contact, and in `sweep` with step sizes, steps end at the times.)
+        save_every: number of steps between saved times; a divisor of num_steps. save_every=num_steps saves only the
+            start and the end.
+        progress: shows a progress bar in one line on stderr, also under jit. A reverse derivative shows one for each
+            pass.
+        extrapolate: number of runs for Richardson extrapolation, 1 to 4, with steps dt, dt/2, dt/4, ... and the same
+            saved times. For a stepper of order p, 2 removes the error of order dt^p for three times the work; 3 also
+            removes that of order dt^(p + 1), for seven times the work. `hht` then has order 3 and 4. (alpha = 0 has
+            order 4 with 2 already, but order 3 with rotations unless kinematics="lie". With uneven steps only alpha = 0
+            gains, to order 3.) Use it for motions that dt resolves; elsewhere it increases errors. Steps must be
+            smooth, as with linearize="predictor". An error dt^3 remains where "auto" changes its choice, or where a
+            step contains an event or a switch of dry friction. `friction` and `sticking` are taken from the run with
+            the shortest steps. So is everything at a saved time that lies after an event in some of the runs only.
         t0: time of the start.
-        events: a list of `Event`: impacts, end stops, switches, ends of the run, located within the step in which they
-            happen, or at known times; the grid stays what it is. Steps without one take as long as before, and a look
-            at the guards. For the `hht` family, Rosenbrock and Runge-Kutta methods.
-        max_events: how many of those that change something may fall into one step; more are a failure. With `adaptive`
-            steps become shorter first, and what lies behind an event has an error of its own.
-        keep_events: how many `run.events` has room for.
-        output: a function of some of q, v, w (the acceleration), L (multipliers), z, zdot, friction, sticking, t and
-            params, by these names: `output(q, w, params)`, `output(q, v, w, L, z, t, params)`. It returns a pytree of
-            arrays. These are saved, as `run.output`, in the place of q, v and all else, so that a long run of a large
-            system keeps little. `check` works as before. What a system does not have is None; of a first-order system
-            q is y, and v its rate. params are those of the moment, as events have switched them and inputs are held.
-            Extrapolation takes the errors out of the outputs, number by number: of rotations return their entries
-            only where that is meant. `verify` compares q at the samples, which it keeps while it runs.
-        throw: whether a run that failed is an error; else it is a `FailedRunWarning`. Both say what `solution.check()`
-            says. Inside jit and vmap neither is known: there call `check()` on what comes out.
+        events: a list of `Event`: impacts, end stops, switches, ends of the run. Each is located within the step in
+            which it happens, or given at a known time; the time grid does not change. A step without an event only
+            costs an evaluation of the guards more. For the `hht` family, Rosenbrock and Runge-Kutta methods.
+        max_events: largest number of events with a reset or switch in one step; with more the run fails. With
+            `adaptive`, steps are shortened first, and the remainder of a step after an event has its own error
+            estimate.
+        keep_events: number of events that `run.events` can hold.
+        output: a function whose arguments are any of q, v, w (the acceleration), L (multipliers), z, zdot, friction,
+            sticking, contact, t and params, by these names: `output(q, w, params)`, `output(q, v, w, L, z, t, params)`.
+            It returns a pytree of arrays, which is saved as `run.output` instead of q, v and everything else. A long
+            run of a large system then needs little memory. `check` works as before. Quantities that the system does not
+            have are None. For a first-order system q is y and v its rate. params are those valid at the time, after
+            switches of events and with held inputs. Richardson extrapolation is applied to each number of the output;
+            do not return rotations unless entrywise extrapolation is what you want. `verify` compares q at the samples,
+            which it keeps during the run.
+        throw: whether a failed run raises an error; otherwise it gives a `FailedRunWarning`. Both say what
+            `solution.check()` says. Neither works inside jit and vmap: call `check()` on the result there.
 
     Returns:
         A `Solution`.
 
-    Differentiable, forward and reverse, in dt, t0, params, q0, v0, z0 and the numbers of the stepper; reverse
-    mode computes the steps again, in blocks, and its memory grows with the square root of num_steps, but for a
-    megabyte that it may take to do so only once.
-    Compiled once for each system, stepper, structure, num_steps and save_every; a new dt, q0 or params
-    costs no compilation, but for numbers of another type: 4 after 4.0, or np.float64(4.0), is another program, and
-    so is an array after a number. Functions are known by identity and by what they read from outside: globals, cells of
-    closures, attributes of modules and of objects, entries of lists and dicts, arrays by their bytes. Where one of
-    these differs, here as in `fit`, the program is made anew; through params it costs no compilation. Inside a `jit` of
-    your own JAX's rule holds: what a function has read when that was traced stays.
+    Differentiable, forward and reverse, in dt, t0, params, q0, v0, z0 and the numbers of the stepper. Reverse mode
+    recomputes the steps in blocks; its memory grows with the square root of num_steps. Up to 1 MB of states is stored
+    instead, so that steps are recomputed only once.
+
+    Compiled once for each system, stepper, structure, num_steps and save_every. A new dt, q0 or params costs no
+    compilation unless a type changes: 4 instead of 4.0, np.float64(4.0) instead of 4.0, or an array instead of a number
+    is another program. Functions are compared by identity and by everything they read from outside: globals, closure
+    variables, attributes of modules and objects, entries of lists and dicts, and arrays by their bytes. If any of these
+    has changed, the program is compiled anew, here as in `fit`. Values passed through params cost no compilation.
+    Inside your own `jit` JAX's rule holds: values that a function read during tracing are kept.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind, shape, structure or value; initial values that violate
-            a constraint. Values are checked unless they are tracers.
+        TypeError, ValueError: an argument of a wrong kind, shape, structure or value; initial values that violate a
+            constraint. Values of tracers are not checked.
         SimulationError: the run failed, if `throw`.
-        NotImplementedError: a constraint, rotations, internal states, dry friction, events, steps of unequal size or
-            error control, where the stepper does not know them.
+        NotImplementedError: the stepper does not support constraints, rotations, internal states, dry friction, events,
+            unequal steps or error control, and one of them is asked for.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: -params["k"] * q)
@@ -156,7 +162,7 @@ def simulate(
     >>> [round(float(q), 4) for q in solution.q[:, 0]]                       # cos(2 t)
     [1.0, 0.8776, 0.5403, 0.0707, -0.4161]
 
-    What a sensor shows, at its own times, and nothing else:
+    What a sensor shows at given times, and nothing else:
 
     >>> solution = hhtjax.simulate(
     ...     spring, hhtjax.hht(), jnp.array([1.0]), jnp.array([0.0]), {"k": 4.0}, dt=1e-3, times=[0.25, 0.6, 1.0],
@@ -169,8 +175,8 @@ def simulate(
     save_every = require_integer("simulate", "save_every", save_every)
     if system.contact is not None and extrapolate != 1:
         raise NotImplementedError(
-            "simulate: leave `extrapolate` out with contact: steps within which it switches have no error in powers of "
-            f"dt; received {extrapolate!r}."
+            "simulate: leave `extrapolate` out with contact: a step in which a contact switches has no error expansion "
+            f"in powers of dt; received {extrapolate!r}."
         )
     if not isinstance(extrapolate, int) or isinstance(extrapolate, bool) or not 1 <= extrapolate <= MOST:
         raise ValueError(f"simulate: `extrapolate` must be an integer from 1 to {MOST}; received {extrapolate!r}.")
@@ -195,9 +201,9 @@ def simulate(
         dt = require_steps_to("simulate", times, dt, num_steps, save_every, problem.t0)
         if progress:
             raise NotImplementedError(
-                "simulate: with `times` and a number for `dt`, leave `progress` out. The number of steps is data, "
-                "and all of them are one program, between whose parts nothing can be drawn. For a bar give `num_steps` "
-                "and read the run off by hhtjax.interpolate(run, times)."
+                "simulate: with `times` and a number for `dt`, leave `progress` out. All steps are then one program, "
+                "which cannot be interrupted to draw a bar. For a bar give `num_steps`, and sample the run by "
+                "hhtjax.interpolate(run, times)."
             )
         if events is not None:
             events = require_events("simulate", problem, events, dt)
@@ -232,13 +238,13 @@ def simulate(
 
 
 def grows_at_once(dt: Real) -> bool:
-    """Whether some of these steps (N,), as far as they are known, are too long behind the one before."""
+    """Whether a step of dt (N,) may be too long compared with the previous one; True if dt is not concrete."""
     return not is_concrete(dt) or bool(np.any(np.asarray(dt)[1:] > GROWTH * np.asarray(dt)[:-1]))
 
 
 @partial(Programs, static_argnames=("room",))
 def _read_off(problem: Problem, times: Array, dt: Array, events, *, room: tuple) -> Solution:
-    """The run with equal steps, at times between them."""
+    """The run with equal steps, sampled at times between them."""
 
     def run(problem: Problem, times: Array, dt: Array, events) -> Solution:
         t0, times, dt = map(problem.times, (problem.t0, times, dt))
@@ -249,8 +255,8 @@ def _read_off(problem: Problem, times: Array, dt: Array, events, *, room: tuple)
 
 @partial(Programs, static_argnames=("room",))
 def _land(problem: Problem, times: Array, dt: Array, events, *, room: tuple) -> Solution:
-    """The run with steps that end at the times, and are no longer than dt: between those of a contact that meets,
-    sticks or lets go there are kinks."""
+    """The run with steps of at most dt that end at the times. Contacts have kinks in the motion, where interpolation
+    would be inaccurate."""
     t0, times, dt = map(problem.times, (problem.t0, times, dt))
     grid = jnp.concatenate([t0[None], times])
     substeps, sizes = (x[0] for x in fit_to_times(dt[None], grid))
@@ -282,7 +288,7 @@ def _simulate(
 
 
 def _at_ends(run: Run, dt: Array, every: int, length: int, in_batch: bool, progress: bool):
-    """A sample at the end of each of `length` intervals of so many steps."""
+    """A sample at the end of each of `length` intervals of `every` steps."""
     loop, form = run.loop, run.form
     step = form.of(loop.advance)
     save, as_saved = savings(run)
@@ -322,7 +328,8 @@ def _with_bar(
     save_every: int,
     unknowns: int,
 ):
-    """The same intervals, with a bar drawn outside of kernels: between several of them, or within long ones."""
+    """The same intervals with a progress bar, which is drawn outside of kernels: between blocks of intervals, or within
+    long ones."""
     announce()
     total = length * save_every
     every = steps_between(total, unknowns)
@@ -350,8 +357,8 @@ def _with_bar(
 
 
 def known_factors(problem: Problem, dt: Real):
-    """The `Factors` for the steps dt of a run, while something is traced; None where they are not constant, or large:
-    a program would hold them."""
+    """The `Factors` of a `LinearSystem` for steps of size dt, computed now although a caller is being traced. None if
+    they are not constant, or so large that the program should not contain them."""
     system, stepper = problem.system, problem.stepper
     if not isinstance(system, LinearSystem) or not is_traced() or jnp.ndim(dt):
         return None

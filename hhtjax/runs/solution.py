@@ -1,4 +1,4 @@
-"""What a run returns, and how it tells of a step that failed."""
+"""What a run returns, and how `check` reports a step that failed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class FailedRunWarning(RuntimeWarning):
-    """A run failed, as its `check` says in words; `throw=True` raises a `SimulationError` instead."""
+    """A run failed; the message says what `check` says. With `throw=True` a `SimulationError` is raised instead."""
 
 
 class SimulationError(RuntimeError):
@@ -34,16 +34,16 @@ class SimulationError(RuntimeError):
 
 @shown
 class ContactForces(NamedTuple):
-    """What contacts do at the saved times.
+    """Forces and states of contacts at the saved times.
 
     Attributes:
-        normal: (K + 1, m), the forces that press bodies apart, N; 0 where they do not touch.
-        friction: (K + 1, m), those along the surfaces, positive against negative sliding.
-        closed: (K + 1, m), whether bodies touch.
-        sticking: (K + 1, m), whether they also stick; never without friction.
-        impacts: (K + 1, m), how many impacts there have been.
-        rests_since: (K + 1, m), since when a closed contact has been so, s; -inf: from the start on; inf: it is open.
-            Of one that bounced, the time at which infinitely many bounces would have ended.
+        normal: (K + 1, m), normal forces, N, positive where they press the bodies apart; 0 where they do not touch.
+        friction: (K + 1, m), forces along the surfaces, positive if they oppose negative sliding.
+        closed: (K + 1, m), whether the bodies touch.
+        sticking: (K + 1, m), whether they also stick; always False without friction.
+        impacts: (K + 1, m), number of impacts so far.
+        rests_since: (K + 1, m), the time since which a closed contact has been closed, s; -inf: since the start; inf:
+            it is open. After bouncing it is the time at which the infinite sequence of bounces would have ended.
     """
 
     normal: Array
@@ -55,7 +55,7 @@ class ContactForces(NamedTuple):
 
     @classmethod
     def of(cls, contact: ContactState) -> ContactForces:
-        """Those of a state of a step."""
+        """The forces and states of contacts in the state of a step."""
         m = contact.closed.shape[-1]
         closed = contact.closed > 0
         since = jnp.where(closed, contact.since, jnp.inf)
@@ -68,18 +68,17 @@ class Failure(NamedTuple):
     """The first step that failed, as data.
 
     Attributes:
-        step: its number, from 1, or 0 if none did.
+        step: its number, from 1; 0 if no step failed.
         newton: whether Newton's iteration failed while the state was still finite.
         quantity: number of the first quantity that is not finite.
-        row: index of the row of the constraint that came to depend on those before it, -1 if none did; None without
+        row: index of the first constraint row that became dependent on the rows before it, -1 if none did; None without
             constraints.
-        solve: what the linear solve left of its right-hand side, if that was too much, else 0; None where the solve is
-            the library's own.
-        friction: `info.friction`, if that was too much, else 0; None without dry friction.
-        mass: what is wrong with a mass that is a function, at the start: 0 nothing, 1 it is not symmetric, 2 not
-            positive definite (with constraints: not positive semidefinite); None where the mass is constant.
+        solve: the relative residual of the linear solve if it was too large, else 0; None for the library's own solve.
+        friction: `info.friction` if it was too large, else 0; None without dry friction.
+        mass: what is wrong at the start with a mass that is a function: 0 nothing, 1 it is not symmetric, 2 not
+            positive definite (with constraints: not positive semidefinite); None if the mass is constant.
         event: what went wrong at an event, 0 nothing; None without events. guard: the number of that event.
-        contact: `info.contact`, what went wrong with contacts, 0 nothing; None without.
+        contact: `info.contact`, what went wrong with contacts, 0 nothing; None without contacts.
     """
 
     step: Any
@@ -94,7 +93,7 @@ class Failure(NamedTuple):
     contact: Any = None
 
     def _verdict(self) -> str:
-        """How many failed, or what did."""
+        """How many runs failed, or why one did."""
         step, quantity = known(self.step), known(self.quantity)
         if step is None or quantity is None:
             return ""
@@ -107,7 +106,7 @@ class Failure(NamedTuple):
         if known(self.newton):
             return "Newton did not converge"
         if known(self.solve):
-            return "the linear solve left too much"
+            return "the linear solve has too large a residual"
         if known(self.friction):
             return "the dry friction was not found"
         if contact := known(self.contact):
@@ -124,22 +123,22 @@ QUANTITIES = (
 )  # fmt: skip
 MASS = (None, "symmetric", "positive definite", "the same at all velocities")
 CONTACT = {  # what went wrong with contacts
-    Fault.NO_FORCES: "no contact forces were found that neither pull nor hold more than friction allows. Take a "
-    "smaller dt, or less `friction`",
-    Fault.MANY: "contacts let go, stick and slide too often within the step. Take a smaller dt",
+    Fault.NO_FORCES: "no contact forces satisfy the contact and friction laws: normal forces that push, friction "
+    "within its limits. Take a smaller dt, or less `friction`",
+    Fault.MANY: "contacts separate, stick and slide too often within the step. Take a smaller dt",
     Fault.JAMMED: "a contact jams: with so much friction, more normal force presses the bodies together (Painleve). "
-    "Take less `friction`, or compliance in `force`",
-    Fault.SEVERAL: "bodies that touch each other meet at several contacts at once, with a `restitution` above 0: what "
-    "they do then depends on the order. Take restitution 0",
+    "Take less `friction`, or a compliant `force`",
+    Fault.SEVERAL: "several contacts that affect each other collide at the same time, with a `restitution` above 0: "
+    "the outcome depends on the order. Take restitution 0",
     Fault.OPEN: "the gap of a closed contact was not brought to 0: its surfaces are too curved for the step. Take a "
     "smaller dt",
     Fault.OVERLAP: "at the start bodies overlap",
-    Fault.APPROACH: "at the start bodies touch and go into each other",
+    Fault.APPROACH: "at the start bodies touch and move into each other",
     Fault.RANGE: "the `friction` of a contact must be a finite number, 0 or more, and its `restitution` lie in [0, 1]",
 }
 WAYS = {
     INDEFINITE: f". {MASSLESS}",
-    OF_VELOCITY: ": from_lagrangian takes energies that are quadratic in v. Write others as a System(mass, force)",
+    OF_VELOCITY: ": from_lagrangian needs a kinetic energy quadratic in v. For others write a System(mass, force)",
 }
 INTERNAL_STATE = 4  # among them
 
@@ -150,24 +149,26 @@ class Solution(NamedTuple):
 
     Attributes:
         t: (K + 1,).
-        q, v, acceleration: pytrees like q0 and v0 with a leading axis K + 1; of a first-order system y, y' and None.
-        multipliers: L (K + 1, m), None without constraints: M w = Q + B^T L.
-        dt: the step size; (N,) of steps that were given, one for each; (K,) of a sweep over `times`, one for each
-            interval.
-        info: `Info` for each of the K intervals between saved times: largest residual, number of Newton iterations, all
-            converged, how far the constraints drift; None where the method has nothing to tell.
+        q, v, acceleration: pytrees like q0 and v0 with a leading axis K + 1; for a first-order system y, y' and None.
+        multipliers: L (K + 1, m), with M w = Q + B^T L; None without constraints.
+        dt: the step size; (N,) if N step sizes were given; (K,) in a sweep over `times`, one for each interval.
+        info: `Info` for each of the K intervals between saved times: largest residual, number of Newton iterations,
+            whether all converged, constraint drift. A field is None if the method does not report it.
         failure: the first step that failed, a `Failure`; `check` turns it into an error.
-        z, zdot: internal states and their rates, like z0 with a leading axis K + 1; None without.
-        friction: tau (K + 1, m), dry friction, positive against positive sliding; None without.
-        sticking: (K + 1, m), whether a joint sticks; None without.
-        contact: `ContactForces`, what contacts do; None without.
-        steps: what error control chose, the `Steps`; dt are those accepted. None without.
-        error: (K + 1,) of a run with `adaptive(verify=)`, that of q at each saved time, in its largest coordinate.
-        failed: whether the run failed, a property; (B,) of a batch: which members did.
-        allowed: what `check` lets pass of it, 10 (rtol max|q| + atol); a tenth of that with verify="tighten".
-        events: what happened on the way, `Events`; None without.
-        output: what `output=` returned, a pytree with a leading axis K + 1, in the place of q, v, acceleration,
-            multipliers, z, zdot, friction and sticking, which are None then; None without.
+        z, zdot: internal states and their rates, like z0 with a leading axis K + 1; None without internal states.
+        friction: tau (K + 1, m), dry friction, positive for positive sliding; None without dry friction.
+        sticking: (K + 1, m), whether a joint sticks; None without dry friction.
+        contact: `ContactForces`; None without contacts.
+        steps: the steps that error control chose, a `Steps`; dt then holds the accepted ones. None without error
+            control.
+        error: (K + 1,), the error of q at each saved time, in its largest coordinate, for a run with
+            `adaptive(verify=)`.
+        failed: whether the run failed, a property; (B,) for a batch: which members failed.
+        allowed: the largest `error` that `check` accepts, 10 (rtol max|q| + atol); a tenth of that with
+            verify="tighten".
+        events: the events of the run, `Events`; None without events.
+        output: what `output=` returned, a pytree with a leading axis K + 1; q, v, acceleration, multipliers, z, zdot,
+            friction and sticking are then None. None without `output=`.
     """
 
     t: Array
@@ -191,8 +192,8 @@ class Solution(NamedTuple):
 
     @property
     def failed(self) -> Array:
-        """Whether the run failed, or, of a batch, which members did: those that `check` would raise for, but for
-        `reach` and times that float32 cannot tell apart. Data, inside jit too."""
+        """Whether the run failed; for a batch, which members did. These are the failures for which `check` raises,
+        except `reach` and times that float32 cannot distinguish. An array, also inside jit."""
         batch = self.t.shape[:-1]
         failed = (self.failure.step > 0) | ~jnp.all(jnp.diff(self.t) >= 0, axis=-1)
         failed |= jnp.any((self.dt <= 0).reshape(*batch, -1), axis=-1)
@@ -203,16 +204,16 @@ class Solution(NamedTuple):
         return failed
 
     def _is_known(self) -> bool:
-        """Whether what `check` looks at are numbers: outside of jit, vmap and grad."""
+        """Whether `check` can read the values, which is so outside of jit, vmap and grad."""
         return all_concrete((self.failure, self.dt, self.t, self.steps, self.error))
 
     def check(self, reach=None):
-        """Raises `SimulationError` naming the first bad step, the quantity and why; silent when all is well.
+        """Raises `SimulationError` if the run failed, naming the first bad step, the quantity and the reason.
 
-        reach: how far q may get from its start, in any coordinate and its unit. A run that gets farther has blown up,
-        although it is finite still, and is named by the first saved time. By default q may go anywhere.
+        reach: largest distance of q from its start, in any coordinate and its unit. A run that goes farther counts as
+        failed although it is finite; the first such saved time is named. Default: no limit.
 
-        For a batch made by vmap, names the first bad member. Not to be called inside jit.
+        For a batch made by vmap it names the first bad member. It cannot be called inside jit.
         """
         if not self._is_known():
             raise TypeError("check: the solution is a tracer: call check() outside jit, vmap and grad.")
@@ -220,7 +221,7 @@ class Solution(NamedTuple):
             raise SimulationError(f"simulate: {fault}")
 
     def _fault(self, reach=None):
-        """What is wrong with the run, in words; None where nothing is."""
+        """The message for what is wrong with the run; None if nothing is."""
         t, dt = np.asarray(self.t), np.asarray(self.dt)
         if self.steps is None:
             fault = bad_steps(t, dt, self.events is not None)
@@ -235,7 +236,7 @@ class Solution(NamedTuple):
         if reach is not None:
             require_number("check", "reach", reach, lambda x: x > 0, "be positive")
             if self.q is None and self.output is not None:
-                raise ValueError(f"check: leave `reach` out: the run has kept its output, and no q; received {reach}.")
+                raise ValueError(f"check: leave `reach` out: the run saved `output` only, and no q; received {reach}.")
             strays = self._first_beyond(reach)
             strays = np.where((steps > 0) & (steps <= strays), 0, strays)
         bad = np.where(strays > 0, strays, steps)
@@ -251,7 +252,7 @@ class Solution(NamedTuple):
         return f"{which}step {step} (to t = {time:.6g}) failed: {why}."
 
     def _excess(self):
-        """Where the error of the whole run is more than what was asked for, in words."""
+        """The message if the error of the whole run is larger than allowed."""
         error, allowed = np.asarray(self.error), np.asarray(self.allowed)
         bad = ~(error <= allowed[..., None])
         if not bad.any():
@@ -268,7 +269,7 @@ class Solution(NamedTuple):
         return f"{known} coarser run, and {asked} although steps were chosen for {share:.2g} of the tolerance."
 
     def _table(self) -> Table:
-        """The run in a line, and its arrays."""
+        """One line about the run, and its arrays."""
         rows = leaf_rows(q=self.q, v=self.v, acceleration=self.acceleration, multipliers=self.multipliers)
         rows += leaf_rows(z=self.z, zdot=self.zdot, friction=self.friction, sticking=self.sticking)
         rows += leaf_rows(contact=self.contact)
@@ -276,7 +277,7 @@ class Solution(NamedTuple):
         return Table(f"Solution: {self._title()}", [["", "shape", "dtype"], *rows, *leaf_rows(info=self.info)])
 
     def _title(self) -> str:
-        """Saved times, steps, and what `check` would say; of tracers, and of parts of a run, the times alone."""
+        """Saved times, steps, and what `check` would say. Only the times for tracers and for parts of a run."""
         numbers = all_known((self.t, self.dt, self.failure))
         if len(numbers) < 2 + 3:
             return f"t {brief(self.t)}"
@@ -297,7 +298,7 @@ class Solution(NamedTuple):
         return f"{batch}{t.shape[-1]} saved times, t = {between(t, 's')}, dt = {between(dt, 's')}; {verdict}"
 
     def _why(self, member: tuple) -> str:
-        """What `failure` says of one member of a batch."""
+        """The message for one member of a batch, from `failure`."""
         found = (0 if x is None else np.asarray(x)[member] for x in self.failure)
         _, newton, quantity, row, left, friction, mass, event, guard, contact = found
         if mass:
@@ -309,9 +310,9 @@ class Solution(NamedTuple):
         if left:
             return (
                 f"the linear solve of the step leaves a residual of {left:.2g} of its right-hand side. Take a larger "
-                "half_bandwidth of banded(), a pattern of sparse_lu() that leaves nothing out, more iterations of "
-                "conjugate_gradients(), or another solve(A, b); a larger `tolerance` of these accepts it. With sparse "
-                "matrices M, C and K are too far apart in size for this step, or for float32"
+                "half_bandwidth of banded(), a complete pattern of sparse_lu(), more iterations of "
+                "conjugate_gradients(), or another solve(A, b). A larger `tolerance` of these accepts the residual. "
+                "With sparse matrices, M, C and K differ too much in size for this step, or for float32"
             )
         if contact:
             return CONTACT[float(contact)]
@@ -320,12 +321,12 @@ class Solution(NamedTuple):
         if friction == DEPENDENT:
             return (
                 "directions of dry friction came to depend on each other, which was not known when the run began. Give "
-                'the stepper redundant="least_squares", for all that may depend on each other'
+                'the stepper redundant="least_squares" if directions may depend on each other'
             )
         if friction:
             return (
-                f"joints with dry friction switch too often: {friction:.2g} of the step is left. Take a smaller dt, as "
-                "for forces that drive what slides"
+                f"joints with dry friction switch too often: {friction:.2g} of the step is left. Take a smaller dt, "
+                "short enough to resolve the forces that drive the sliding"
             )
         if newton:
             return (
@@ -335,13 +336,13 @@ class Solution(NamedTuple):
         if self.failure.row is not None and row >= 0:
             return (
                 f"row {row} of the constraint depends on the rows before it, or has no gradient: the position is "
-                'singular. Give the stepper redundant="least_squares", or formulate the constraint anew. '
+                'singular. Give the stepper redundant="least_squares", or reformulate the constraint. '
                 f"{SWITCHED_OFF}"
             )
         started = [x for x in jax.tree.leaves(self.acceleration) if is_concrete(x)]
         if not all(np.isfinite(np.asarray(x)[(*member, 0)]).all() for x in started):
             return (
-                "the acceleration is not finite at the start already: there the mass is singular, constraints depend "
+                "the acceleration is not finite at the start already: the mass is singular there, constraints depend "
                 "on each other (outside jit an error names them), or a function of the system is not finite"
             )
         is_first_order = self.acceleration is None and self.output is None
@@ -349,7 +350,7 @@ class Solution(NamedTuple):
         return f"{names[quantity]} is not finite. Take a smaller dt, or another linearize=, or a method that damps"
 
     def _first_beyond(self, reach: float) -> np.ndarray:
-        """Step of the first saved time at which q is farther than `reach` from its start; 0 if none is."""
+        """Step of the first saved time at which q is farther than `reach` from its start; 0 if there is none."""
         t, axis = np.asarray(self.t), self.t.ndim - 1
         far: Any = np.zeros(t.shape, bool)
         for q in map(np.asarray, jax.tree.leaves(self.q)):
@@ -358,7 +359,7 @@ class Solution(NamedTuple):
         return np.take_along_axis(self._steps_taken(), far.argmax(axis)[..., None], axis)[..., 0]
 
     def _steps_taken(self) -> np.ndarray:
-        """How many steps come before each saved time."""
+        """Number of steps before each saved time."""
         t, dt = np.asarray(self.t), np.asarray(self.dt)
         if self.steps is not None:  # the one that ends at a saved time, or beyond
             taken = np.zeros(t.shape, int)
@@ -377,12 +378,12 @@ class Solution(NamedTuple):
         return np.rint(np.nan_to_num(taken, posinf=0, neginf=0)).astype(int)
 
     def _is_every_step(self) -> bool:
-        """Whether dt has the size of each step, and more than one of them may come before a saved time."""
+        """Whether dt holds the size of each step, with possibly several steps before a saved time."""
         K = self.t.shape[-1] - 1
         return self.steps is not None or (np.ndim(self.dt) == self.t.ndim and self.dt.shape[-1] != K)
 
     def _time_of(self, step: Real, member: tuple) -> Real:
-        """The time at which a step of a member of a batch ends."""
+        """The time at which a step ends, for one member of a batch."""
         taken, t = self._steps_taken()[member], np.asarray(self.t)[member]
         if self._is_every_step():
             return t[0] + np.sum(np.asarray(self.dt)[member][:step])
@@ -394,7 +395,7 @@ class Solution(NamedTuple):
 
 
 def told(caller: str, solution: Solution, throw: bool) -> Solution:
-    """The solution; with a `FailedRunWarning`, or for `throw` an error, where the run failed and that is known now."""
+    """Returns the solution. If it is known to have failed, warns with a `FailedRunWarning`, or raises if `throw`."""
     if solution.failure is None or not is_concrete(solution.failure.step):
         return solution
     failure, steps = solution.failure.step, solution.steps
@@ -410,26 +411,28 @@ def told(caller: str, solution: Solution, throw: bool) -> Solution:
 # What was wrong with the times and the step sizes of a run, in words: what was traced is not known before.
 
 
-ORDER = "`times` must increase, and lie after t0; with it they were {}."
-ALIKE = "times are alike in {}, near t = {:g}: count from a t0 near zero, or take float64."
+ORDER = "`times` must increase, and lie after t0; with t0 in front they were {}."
+ALIKE = "times are equal in {}, near t = {:g}: count from a t0 near zero, or take float64."
 
 
 def first_bad(bad):
-    """The index of the first bad member of a batch, and words for it; () and none where there is no batch."""
+    """The index of the first bad member of a batch, and words for it; () and "" for a single run."""
     member = tuple(int(i) for i in np.argwhere(bad)[0])
     words = f"member {', '.join(map(str, member))} ({np.count_nonzero(bad)} of {bad.size} failed), "
     return member, words if member else ""
 
 
 def bad_samples(t: np.ndarray, dt: np.ndarray):
-    """Of a run under error control, with times (..., K + 1) and the steps that it chose, NaN behind the last."""
+    """The message for bad times or steps of a run under error control: times (..., K + 1), and dt NaN after the last
+    step."""
     if not np.all(np.diff(t) >= 0):  # behind an event that ends the run they are its end
         return ORDER.format(t)
     return ALIKE.format(t.dtype, t.flat[0]) if np.any(dt == 0) else None
 
 
 def bad_steps(t: np.ndarray, dt: np.ndarray, has_events: bool):
-    """Of a run with given steps, and of a sweep, whose dt are NaN where they would be longer than between samples."""
+    """The message for bad times or steps of a run with given steps. In a sweep, a dt longer than the interval is
+    NaN."""
     gaps, unknown = np.diff(t), np.isnan(dt)
     is_over_times = t.ndim > 1 and dt.shape == gaps.shape
     if is_over_times and unknown.any() and not np.all((gaps > 0) & np.isfinite(gaps)):
@@ -456,17 +459,18 @@ WHOLE = 65  # numbers, at least: an array of fewer would be taken to pieces
 
 @shown
 class Events(NamedTuple):
-    """The events of a run, in their order; with `keep_events` entries, NaN (of `which` -1) beyond those that were met.
+    """The events of a run, in their order, with `keep_events` entries. Unused entries are NaN (-1 in `which`).
 
     Attributes:
-        count: how many were met, also those beyond the entries.
-        t: (keep_events,), when; differentiable.
-        which: (keep_events,), the number of the event.
-        q: where, like q0 with a leading axis; None of a first-order system.
-        before, after: v before and after each, like v0 with a leading axis; y of a first-order system.
-        z: internal states there, None without.
-        rate: (keep_events,), dg/dt before, the part of multipliers as they change over the step. Where it is small
-            beside the velocities the motion grazes the guard, and derivatives are huge, at last infinite.
+        count: number of events, including those for which there was no entry left.
+        t: (keep_events,), their times; differentiable.
+        which: (keep_events,), the number of the event in `events`.
+        q: position at the event, like q0 with a leading axis; None for a first-order system.
+        before, after: v before and after the event, like v0 with a leading axis; y for a first-order system.
+        z: internal states at the event; None without internal states.
+        rate: (keep_events,), dg/dt before the event; multipliers contribute as they change over the step. If it is
+            small compared with the velocities, the motion grazes the guard; derivatives are then very large, and
+            infinite in the limit.
     """
 
     count: Array
@@ -479,7 +483,7 @@ class Events(NamedTuple):
     rate: Any
 
     def _verdict(self):
-        """How many, and whether some are lost; of a batch the fewest and the most."""
+        """How many events, and whether some were not kept; for a batch the smallest and the largest number."""
         count, times = known(self.count), known(self.t)
         if count is None or times is None or not count.size or not times.ndim:
             return ""
@@ -488,20 +492,20 @@ class Events(NamedTuple):
 
 
 class Log(NamedTuple):
-    """The events met so far, on vectors: how many, and a column of numbers for each that is kept, NaN beyond, and for
-    those of one step more, of which nothing is told."""
+    """The events so far, as vectors: their number, and a column for each that is kept. Unused columns are NaN.
+    Additional columns for the events of one step serve as a buffer and are not reported."""
 
     count: Array
     columns: Array
 
     @classmethod
     def empty(cls, like: PyTree, keep: int, at_once: int) -> Log:
-        """Room for so many columns like this one, and for so many in a step."""
+        """An empty log for `keep` columns like this one, and `at_once` more for the events of one step."""
         number = max(keep + at_once, -(-WHOLE // like.size))
         return cls(jnp.zeros((), jnp.int32), jnp.full((like.size, number), jnp.nan, like.dtype))
 
     def with_more(self, rows: Array, there: Array, keep: int) -> Log:
-        """With the first of these, as many as are there, as long as there is room; the others are NaN."""
+        """The log with those rows for which `there` is true, as long as there is room; unused columns are NaN."""
         places = jnp.cumsum(there, dtype=self.count.dtype) - 1
         numbers = jnp.arange(len(places), dtype=places.dtype)
         here = there[None, :] & (places[None, :] == numbers[:, None])  # some that are not there may be before
@@ -511,7 +515,7 @@ class Log(NamedTuple):
         return Log(self.count + jnp.sum(there, dtype=self.count.dtype), columns)
 
     def told(self, flat, keep: int) -> Events:
-        """As `Events`."""
+        """The log as `Events`."""
         n, N, columns = flat.positions, flat.size, self.columns[:, :keep]
         end = len(columns) - 2 * N  # of q, in which a rotation has nine numbers
         t, which, rate, *columns = jnp.split(columns, [1, 2, 3, end, end + N])
@@ -524,7 +528,7 @@ class Log(NamedTuple):
 
 
 def row_of(t: Array, which: Array, rate: Array, q: Array, before: Array, after: Array) -> Array:
-    """What is noted of an event."""
+    """The entries of a log for one event."""
     return jnp.concatenate([jnp.stack([t, which.astype(t.dtype), rate]), q, before, after])
 
 
@@ -535,44 +539,45 @@ def row_of(t: Array, which: Array, rate: Array, q: Array, before: Array, after: 
 FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER, NEGATIVE, THROWN, SINGULAR = range(10)
 EVENTS = {  # what it is, before the number of the event, and what to do about it
     MANY: (
-        "more than max_events in a step, the first of them event",
-        "A motion that comes to rest on a guard gives infinitely many: let it rest by a stiff force, or a constraint "
-        "that the event switches on. Else take a smaller dt, or a larger max_events",
+        "more than max_events events in one step, the first of them event",
+        "A motion that comes to rest on a guard causes infinitely many. Let it rest by a `Contact`, a stiff force, or "
+        "a constraint that the event switches on. Otherwise take a smaller dt, or a larger max_events",
     ),
     STAYS: (
-        "the motion stays beyond the guard of event",
-        "A body that rests there needs a stiff force, or a constraint that the event switches on. An event that turns "
-        "nothing back needs a guard that depends on the mode its switch changes. A force that jumps there needs a "
-        "mode, too",
+        "the guard stays negative, because nothing turned the motion back, at event",
+        "A body that rests there needs a `Contact`, a stiff force, or a constraint that the event switches on. An "
+        "event without a reset needs a guard that depends on the mode that its switch changes. So does a force that "
+        "jumps there",
     ),
     ALONG: (
         "no velocity changes the guard of event",
-        "An impact needs a guard that depends on q, and a motion that may follow it",
+        "An impact needs a guard that depends on q, in a direction in which the body can move",
     ),
     CORNER: (
         "another event happens at the same time as event",
-        "Impacts one after the other are not the same as at once: say what happens by one event with its own reset",
+        "Simultaneous impacts have a different outcome from successive ones: describe them by one event with its own "
+        "reset",
     ),
     DIFFER: (
-        "the runs that extrapolate joins do not meet the same events, the first of them event",
+        "the runs combined by extrapolate have different events, the first of them event",
         "Take a smaller dt, or leave extrapolate out",
     ),
     NO_NUMBER: (
-        "q and v are numbers, but not the guard of event",
-        "A guard must be a number beyond its zero, too: q, not sqrt(q)",
+        "q and v are finite, but the guard is NaN at event",
+        "A guard must be finite beyond its zero, too: q, not sqrt(q)",
     ),
     NEGATIVE: (
-        "behind an event, with the params of its switch and the v of its reset, negative is the guard of event",
-        "Guards are positive where the motion goes on: behind its event one may need the other sign, by the mode that "
-        "the switch changes, or another level",
+        "after the switch and the reset of an event a guard is negative, that of event",
+        "Guards must be positive where the motion continues. Let the sign or the level of the guard depend on the "
+        "mode that the switch changes",
     ),
     THROWN: (
-        "what another event changes takes the motion at once beyond the guard of event",
-        "A guard of the velocity jumps with that, and one of params with a switch: say what happens by one event with "
-        "a reset and a switch of its own, or let the guard depend on a mode",
+        "another event made a guard negative at once, that of event",
+        "A reset changes guards of the velocity, and a switch changes guards of params. Describe both events by one, "
+        "with its own reset and switch, or let the guard depend on a mode",
     ),
     SINGULAR: (
-        "the constraint determines no acceleration behind event",
-        f"What its reset and its switch make of v and the params must be numbers, and rows independent. {SWITCHED_OFF}",
+        "the constraint determines no acceleration after event",
+        f"After its reset and switch, v and params must be finite, and the constraint rows independent. {SWITCHED_OFF}",
     ),
 }

@@ -1,7 +1,7 @@
-"""Results of many members in a folder: a file for each chunk, to which many processes may write.
+"""Results of many members in a folder, one file for each chunk; many processes may write at the same time.
 
-A file is there as a whole or not at all. It bears its number and the hash of what it was made from, so that no other
-one is taken for it.
+A file is complete or does not exist. It contains its number and the hash of its inputs, so that files cannot be
+confused.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ NUMBER, INPUTS = "chunk.number", "chunk.inputs"  # in a file, beside the arrays
 
 
 class Names(NamedTuple):
-    """Of the arrays of a chunk. shortened, by: those whose last axis is as long as the largest number in another."""
+    """The layout of the arrays of a chunk. shortened, by: arrays whose last axis is cut to the largest number in
+    another array."""
 
     all: tuple[str, ...]
     shortened: tuple[str, ...] = ()
@@ -37,7 +38,7 @@ class Names(NamedTuple):
 
 
 class Npz(NamedTuple):
-    """A folder of files of NumPy. inputs: the hash of what the members are made from."""
+    """A folder of files of NumPy. inputs: the hash of the inputs of the members."""
 
     caller: str
     folder: Path
@@ -45,11 +46,11 @@ class Npz(NamedTuple):
     names: Names
 
     def path(self, k: int) -> Path:
-        """Of a chunk."""
+        """The path of a chunk."""
         return self.folder / f"chunk-{k:05d}.npz"
 
     def holds(self, k: int) -> bool:
-        """Whether a chunk is there and can be read, by the checksums inside it, and is the one that belongs there."""
+        """Whether the file of a chunk exists, is intact by its checksums, and belongs to this chunk."""
         try:
             with zipfile.ZipFile(self.path(k)) as file:
                 if file.testzip() is not None:
@@ -60,28 +61,28 @@ class Npz(NamedTuple):
             return False
 
     def left(self, chunks: int) -> list[int]:
-        """Which are not there yet."""
+        """The chunks that are missing."""
         return [k for k in range(chunks) if not self.holds(k)]
 
     def missing(self, these: Sequence[int]) -> list[int]:
-        """Which of those that were written are not here."""
+        """Those of the written chunks that are not in the folder."""
         return [k for k in these if not self.path(k).exists()]
 
     def write(self, k: int, kept: int, arrays: Sequence[np.ndarray]):
-        """A chunk; where another process has written it meanwhile, its file is replaced by the same."""
+        """Writes a chunk. If another process has written it meanwhile, its file is replaced by an equal one."""
         marks: dict[str, Any] = {NUMBER: np.asarray(k), INPUTS: np.asarray(self.inputs)}
         named = self.names.given(arrays, kept)
         write_whole(self.caller, self.path(k), lambda file: np.savez(file, **named, **marks))
 
     def begin(self, manifest: dict[str, Any]):
-        """Writes the manifest, or compares it with the one that is there."""
+        """Writes the manifest, or compares it with the existing one."""
         path = self.folder / MANIFEST
         if not path.exists():
             stray = sorted(self.folder.glob("chunk-*.npz"))
             if stray and not path.exists():  # by now another caller may have begun
                 raise ValueError(
-                    f"{self.caller}: `folder` {self.folder} holds {stray[0].name}, but no {MANIFEST} that tells of "
-                    "which sweep: nothing was changed there; choose another folder, or empty it."
+                    f"{self.caller}: `folder` {self.folder} holds {stray[0].name}, but no {MANIFEST} that says to "
+                    "which sweep it belongs. Nothing was changed there: choose another folder, or empty it."
                 )
             self.folder.mkdir(parents=True, exist_ok=True)
             write_whole(self.caller, path, lambda file: file.write(json.dumps(manifest, indent=1).encode() + b"\n"))
@@ -89,22 +90,22 @@ class Npz(NamedTuple):
         require_same(self.caller, self.folder, read_manifest(path), manifest)
 
     def end(self):
-        """Removes what workers that died have left."""
+        """Removes temporary files of workers that died."""
         for path in self.folder.glob(".*.part"):
             path.unlink(missing_ok=True)
 
 
 def require_same(caller: str, folder: Path, found: Mapping[str, Any], manifest: dict[str, Any]):
-    """An error unless what a folder holds was begun with the same inputs and versions."""
+    """Raises an error unless the folder was started with the same inputs and versions."""
     if differ := [key for key in manifest if found.get(key) != manifest[key]]:
         raise ValueError(
-            f"{caller}: `folder` {folder} holds another sweep, whose {', '.join(differ)} differ: nothing was "
-            "changed there; choose another folder, or the inputs that it was begun with."
+            f"{caller}: `folder` {folder} holds another sweep, whose {', '.join(differ)} differ. Nothing was "
+            "changed there: choose another folder, or the inputs of that sweep."
         )
 
 
 def write_whole(caller: str, path: Path, fill: Callable[[Any], Any]):
-    """A file that is there with its whole content, also after a power cut, or not at all."""
+    """Writes a file so that it is complete, also after a power failure, or does not exist."""
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.part")
     try:
         with open(temporary, "wb") as file:
@@ -119,24 +120,24 @@ def write_whole(caller: str, path: Path, fill: Callable[[Any], Any]):
     except FileNotFoundError as error:
         if not path.exists():  # else another writer was done, and its caller has tidied up
             raise FileNotFoundError(
-                error.errno, f"{caller}: {path} cannot be written: the folder must be there, for workers too"
+                error.errno, f"{caller}: {path} cannot be written: the folder must exist, for workers too"
             ) from error
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise OSError(
             error.errno,
-            f"{caller}: {path} could not be written ({error.strerror}); the files before it are whole: "
-            "make room, and repeat the call, which goes on where it stopped",
+            f"{caller}: {path} could not be written ({error.strerror}); earlier files are complete: "
+            "free some space, and repeat the call, which continues where it stopped",
         ) from error
 
 
 def is_chunk(part: Mapping[str, np.ndarray], k: int, inputs: str | None) -> bool:
-    """Whether a file says that it is this chunk of this sweep."""
+    """Whether a file identifies itself as this chunk of this sweep."""
     return NUMBER in part and int(part[NUMBER]) == k and str(part[INPUTS]) == inputs
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """A manifest; nothing of one that is damaged."""
+    """The contents of a manifest; empty if it is damaged."""
     try:
         found = json.loads(path.read_text())
     except ValueError:

@@ -1,4 +1,4 @@
-"""Many runs in one compiled call: step sizes, parameters, initial states and coefficients as data."""
+"""`sweep`: many runs in one compiled call, with step sizes, parameters, initial states and coefficients as data."""
 
 from __future__ import annotations
 
@@ -61,52 +61,54 @@ def sweep(
     throw: bool = False,
     output: Callable | None = None,
 ) -> Solution:
-    """Runs `system` once for each of `dts`, all from t0 on, sampled at common times.
+    """Simulates `system` once for each of `dts`, all from t0 on, and samples all runs at the same times.
 
-    These are `num_samples` at distances H = duration/num_samples, or `times`, at any distances H from one to the next.
-    Each step size is made smaller, if need be, so that a whole number of steps lands on every sample: h = H/ceil(H/dt),
-    reported as `sweep.dt`. Members are sorted by their number of steps and run in blocks, vectorised, each block for as
-    many steps as its longest member needs: the work is about the sum over the members. A member that fails is named by
-    `check()` and leaves the others as they are.
+    The samples are `num_samples` equally spaced times, at intervals H = duration/num_samples, or `times`, at any
+    intervals H. Each step size is reduced, if necessary, so that a whole number of steps ends on every sample: h =
+    H/ceil(H/dt), returned as `sweep.dt`. Members are sorted by their number of steps and run in vectorised blocks. A
+    block takes as many steps as its longest member needs, so the total work is close to the sum over the members. A
+    member that fails is named by `check()` and does not affect the others.
 
     Args:
         system, stepper, q0, v0, params, z0, t0: as for `simulate`.
-        dts: (B,) step sizes, positive, at most H. Their number B is part of the program, their values are data.
-            Or `adaptive(rtol, atol)`, of which each number may be (B,): each member has steps that its errors choose,
-            and that end at no sample; with max_steps numbers in memory for each.
+        dts: (B,) step sizes, positive, at most H. Their number B is part of the program, their values are data. Or
+            `adaptive(rtol, atol)`, where each number may be (B,): each member then has steps chosen by its errors,
+            which need not end on the samples. This takes memory for max_steps numbers per member.
         duration: positive. num_samples: K, the number of samples after the start.
-        times: (K,), in the place of both: strictly increasing, after t0; data too. Steps end at each: unlike SciPy's
-            `t_eval` they shorten steps, and dts are upper bounds, like its `max_step`. A dt larger than H, or infinite,
-            takes the one step H. The `hht` family is of order 2 whatever they are.
-        in_axes: what else differs between members: (stepper, q0, v0, params), or one more for z0, each 0 where all its
-            arrays have a leading axis B, None where the members share it, or a pytree of these, as for `jax.vmap`. A
-            stepper with an axis is `jax.vmap(lambda alpha: hhtjax.hht(alpha))(alphas)`.
+        times: (K,), instead of both: strictly increasing, after t0; data too. Steps end at each of them. Unlike SciPy's
+            `t_eval` they therefore shorten steps, and dts are upper bounds, like SciPy's `max_step`. A dt larger than
+            H, or infinite, gives one step of size H. The `hht` family has order 2 for any times.
+        in_axes: what else differs between members: (stepper, q0, v0, params), or one more entry for z0. Each entry is 0
+            if all its arrays have a leading axis B, None if all members share it, or a pytree of these, as for
+            `jax.vmap`. A stepper with an axis is `jax.vmap(lambda alpha: hhtjax.hht(alpha))(alphas)`.
         mesh: devices that share the work, `jax.make_mesh((jax.device_count(),), ("members",))`, also of several
-            processes; each then holds all results, those of one device to rounding. They lie on all devices: take
-            `jax.device_get` of them before mixing them with others.
-        progress: show a bar in one line on stderr, also under jit; once more for each pass of a reverse derivative.
-        output: that of `simulate`: a function whose values are saved in the place of q, v and all else, so that a large
-            sweep keeps little, in memory and, by `sweep_to_disk`, on disk.
-        events, max_events, keep_events: those of `simulate`. A block looks for events in the steps in which one of its
-            members meets some, so that they cost a batch little.
+            processes. Every process then holds all results, which agree with those of one device to rounding. They lie
+            on all devices: call `jax.device_get` before combining them with other arrays.
+        progress: shows a progress bar in one line on stderr, also under jit. A reverse derivative shows one for each
+            pass.
+        output: that of `simulate`: a function whose values are saved instead of q, v and everything else. A large sweep
+            then needs little memory, and little disk space with `sweep_to_disk`.
+        events, max_events, keep_events: those of `simulate`. A block only does the work of an event in steps in which
+            one of its members has one, so events cost a batch little.
         throw: as for `simulate`; the first member that failed is named.
 
     Returns:
         A `Solution` whose leaves have a leading axis B: q (B, K + 1, n), start included; t (B, K + 1), the same for
-        all; dt (B,), the step sizes used, or (B, K), those before each of `times`; failure.step counts each member's
-        own steps. Under error control `steps` are those of each member, dt is (B, N), NaN
-        behind the last of each.
+        all; dt (B,), the step sizes used, or with `times` (B, K), one for each interval; failure.step counts the steps
+        of each member. With error control, `steps` holds the steps of each member, and dt is (B, N), NaN after the last
+        step of each.
 
-    Compiled once for each system, stepper, structure, B and K. To be used inside jit and under vmap over all but dts
-    and times; differentiable, forward and reverse, in all that `simulate` is, and in times, except that the dts only
-    choose the number of steps. Derivatives cost several runs, and are NaN for members with more than 262144 steps
-    between samples; those of a failed member are not finite, nor are those in what it shares with others.
+    Compiled once for each system, stepper, structure, B and K. Works inside jit, and under vmap over everything but dts
+    and times. Differentiable, forward and reverse, in everything in which `simulate` is, and in times, except that dts
+    only choose the number of steps. Derivatives cost several runs. They are NaN for members with more than 262144 steps
+    between samples. Derivatives of a failed member are not finite, nor are those with respect to inputs that it shares
+    with other members.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind, shape or value; those of `simulate`.
         SimulationError: a member failed, if `throw`.
-        NotImplementedError: `times` for a stepper that needs equal steps, `houbolt` or `park`; `adaptive` with a
-            mesh, or for a stepper without an estimate; those of `simulate`.
+        NotImplementedError: `times` with `houbolt` or `park`, which need equal steps; `adaptive` with a mesh, or with a
+            stepper that has no error estimate; those of `simulate`.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: -params["k"] * q)
@@ -119,7 +121,7 @@ def sweep(
     >>> [round(float(q), 4) for q in runs.q[:, -1, 0]]                        # cos(2) = -0.4161
     [-0.4101, -0.4157, -0.4161]
 
-    Other parameters for each, and which members failed:
+    Different parameters for each member, and which members failed:
 
     >>> runs = hhtjax.sweep(
     ...     spring, hhtjax.hht(alpha=0.0), jnp.array([1.0]), jnp.array([0.0]), {"k": jnp.array([4.0, 9.0])},
@@ -127,7 +129,7 @@ def sweep(
     >>> [round(float(q), 2) for q in runs.q[:, -1, 0]], runs.failed.tolist()          # cos(2), cos(3)
     ([-0.42, -0.99], [False, False])
 
-    The energies alone:
+    Saving only the energies:
 
     >>> runs = hhtjax.sweep(
     ...     spring, hhtjax.hht(), jnp.array([1.0]), jnp.array([0.0]), {"k": 4.0}, dts=jnp.full(2, 0.01), duration=1.0,

@@ -1,4 +1,4 @@
-"""Sweeps under error control: the steps of all members first, then their runs over them, the long ones together."""
+"""Sweeps under error control: first the steps of all members, then their runs, with long ones grouped together."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def run_chosen(
     pair: bool,
     room: tuple,
 ) -> Solution:
-    """The same, compiled, with all max_steps. start, choice: data, tolerances, t0, times, events, output, of runs, of
-    steps; pair: whether the two differ."""
+    """As above, compiled, with all max_steps. start, choice: data, tolerances, t0, times, events and output of the
+    runs, and of the steps; pair: whether the two differ."""
     if progress:
         announce()
 
@@ -86,7 +86,7 @@ def run_chosen(
 
 
 def errors(members, choosing, verify, runs, steps, ends, progress):
-    """What the `Solution` tells of its errors, by the runs with halved steps, or with those for a quarter of the
+    """The fields of the `Solution` about its errors, from runs with halved steps, or with steps for a quarter of the
     tolerance."""
 
     def error(arrays, run, finer):
@@ -100,7 +100,7 @@ def errors(members, choosing, verify, runs, steps, ends, progress):
 
 
 def rounds(members, progress):
-    """The last `Round` of all members; those whose runs are as good as asked for wait for the others."""
+    """The last `Round` of all members; members whose error is small enough wait for the others."""
 
     def once(share):
         steps, ends = choose_many(members.for_share(share))
@@ -116,7 +116,7 @@ def rounds(members, progress):
 
 
 def run_many(members: Members, steps: Steps, ends: Array, progress: bool, halved: bool = False) -> Solution:
-    """The runs over these steps, each halved or not, in blocks: of the longest members, the next longest, and so on."""
+    """The runs with these steps, each halved or not, in blocks: the longest members first, then the next longest."""
     t0, times, size, lanes = members.t0, members.times, members.size, members.lanes
 
     def grid(ends: Array, accepted: Array) -> Grid:
@@ -149,7 +149,7 @@ ROUND = 256  # tries of a block, before members are sorted anew
 
 
 class Members(NamedTuple):
-    """Problems and tolerances of many, sharing a part: arrays, with 0 or None for each, as in `jax.vmap`."""
+    """Problems and tolerances of many members that share a part: arrays, with 0 or None for each, as in `jax.vmap`."""
 
     system: Any
     arrays: list
@@ -164,16 +164,16 @@ class Members(NamedTuple):
     output: PyTree = None
 
     def problem(self, arrays: list) -> Problem:
-        """One member's."""
+        """The problem of one member."""
         (stepper, q0, v0, params, z0), _ = jax.tree.unflatten(self.structure, arrays)
         return Problem(self.system, stepper, q0, v0, params, self.t0, z0, self.output)
 
     def control(self, arrays: list) -> Adaptive:
-        """Its tolerances."""
+        """The tolerances of one member."""
         return jax.tree.unflatten(self.structure, arrays)[1]
 
     def for_share(self, share):
-        """The same for so much of their tolerances, one number or one for each member."""
+        """The members with their tolerances multiplied by a share, one number or one for each member."""
         data, control = jax.tree.unflatten(self.structure, self.arrays)
         tolerances = jax.tree.leaves(scaled(control, share))
         of_data = len(self.axes) - len(tolerances)
@@ -181,14 +181,15 @@ class Members(NamedTuple):
         return self._replace(arrays=jax.tree.leaves(data) + tolerances, axes=axes)
 
     def of(self, numbers: Real):
-        """The arrays of the members of these numbers."""
+        """The arrays of the members with these indices."""
         return [x if axis is None else x[numbers] for x, axis in zip(self.arrays, self.axes, strict=True)]
 
 
 def choose_many(members: Members):
-    """`Steps` of each member to the last of the times, and (size, max_steps) where they end; inf behind them.
+    """`Steps` of each member to the last of the times, and (size, max_steps) the times at which they end; inf after the
+    last.
 
-    No tracer of autodiff may come in.
+    Arguments must not be tracers of autodiff.
     """
     search, bounds, walks = Search.begun(members)
     max_steps, size, lanes = search.max_steps, members.size, members.lanes
@@ -252,13 +253,14 @@ class Search(NamedTuple):
         return trial._replace(stops=members.times if problem.stepper.lands else None)
 
     def next(self, arrays: list, bounds: Bounds, walk: Walk):
-        """The walk after one try, the same if it is over, and the end of the step; NaN where none was accepted."""
+        """The walk after one trial step (unchanged if it is finished), and the end of the step; NaN if it was
+        rejected."""
         new, begun = self.form.of(partial(trial_step, self.trial(arrays, bounds)))(walk)
         new = jax.tree.map(partial(jnp.where, is_walking(walk, self.end)), new, walk)
         return new, jnp.where(new.accepted > walk.accepted, begun.end, jnp.nan)
 
     def tries(self, walks: Walk, arrays: list, bounds: Bounds):
-        """The walks of a block after a number of tries, and (ROUND, lanes) the ends of steps."""
+        """The walks of a block after a number of trial steps, and (ROUND, lanes) the ends of steps."""
 
         def unfinished(carry: tuple) -> Array:
             walks, _, number = carry

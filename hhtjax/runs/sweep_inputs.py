@@ -1,4 +1,4 @@
-"""What a sweep is made from: the checks of what a user hands over, and which of it differs between members."""
+"""Checks of the arguments of a sweep, and which of them differ between members."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ NAMES = "stepper", "q0", "v0", "params", "z0"  # of what may differ
 
 
 class Inputs(NamedTuple):
-    """What a sweep is made from, checked: `data` is (stepper, q0, v0, params, z0), `mapped` which leaves differ. With
-    an `Adaptive` for dts, times are given."""
+    """The checked arguments of a sweep: `data` is (stepper, q0, v0, params, z0), `mapped` says which leaves differ
+    between members. With an `Adaptive` as dts, times are given."""
 
     system: Any
     data: PyTree
@@ -74,7 +74,7 @@ class Inputs(NamedTuple):
         times: PyTree = None,
         z0: PyTree = None,
     ) -> Inputs:
-        """An error that names what is wrong, or the inputs."""
+        """The inputs; raises an error that says what is wrong."""
         require_system("sweep", system, massless=True)
         require_stepper("sweep", stepper)
         params = require_params("sweep", params)
@@ -115,7 +115,7 @@ class Inputs(NamedTuple):
         return cls(system, data, dts, duration, t0, mapped, int(num_samples), times, size)
 
     def with_events(self, events, max_events: int, keep_events: int) -> Inputs:
-        """The same with events, looked at for each member."""
+        """The inputs with events, which are checked for each member."""
         room = require_integer("sweep", "max_events", max_events), require_integer("sweep", "keep_events", keep_events)
         if events is None:
             return self
@@ -144,8 +144,8 @@ class Inputs(NamedTuple):
 
     @contextmanager
     def telling_of_axes(self):
-        """In place of an error of shapes, where `in_axes` is missing and some arrays are as long as there are members,
-        one that names these."""
+        """Replaces an error about shapes if `in_axes` is missing and some arrays are as long as there are members, by
+        one that names these arrays."""
         try:
             yield
         except (TypeError, ValueError) as error:
@@ -164,19 +164,19 @@ class Inputs(NamedTuple):
             raise
 
     def chunk(self, members):
-        """The same for the members of these numbers."""
+        """The inputs of the members with these indices."""
         dts = self.dts[members]
         return self._replace(data=_member(self.data, self.mapped, members), dts=dts, size=dts.size)
 
     def sizes(self):
-        """How many numbers the position of a member holds, and how many rates it has."""
+        """The number of entries of the position of a member, and the number of its rates."""
         leaves, structure = jax.tree.flatten(self.data)
         sizes = [math.prod(jnp.shape(x)[flag:]) for x, flag in zip(leaves, self.mapped, strict=True)]
         numbers, rates = (sum(jax.tree.leaves(x)) for x in structure.unflatten(sizes)[1:3])
         return numbers, rates or numbers
 
     def call(self, mesh=None, progress: bool = False):
-        """The arguments and keywords of `run_sweep`; with these what its program is chosen by."""
+        """The arguments and keywords of `run_sweep`, which also determine its program."""
         if mesh is not None and not isinstance(mesh, Mesh):
             raise TypeError(f"sweep: `mesh` must be a jax.sharding.Mesh; received {mesh!r}.")
         data, dts = self.data, self.dts
@@ -197,14 +197,15 @@ class Inputs(NamedTuple):
 def lanes_for(size: int, least: int = 1) -> int:
     """Members in a block: a power of two, so that every block runs the same vector instructions.
 
-    Blocks have to be short enough for their members to be alike, since each works until its slowest is done. If all are
-    alike, they are no shorter than `least`.
+    A block takes as long as its slowest member, so blocks should be short enough that their members take about the same
+    number of steps. If all members are alike, blocks are not shorter than `least`.
     """
     return min(LANES, max(1 << (size // BLOCKS).bit_length(), least))
 
 
 def least_lanes(size: int, unknowns: int, hands: int = 1) -> int:
-    """Of members that are alike: as many as vector instructions are fast with, if no hand gets more to do by it."""
+    """The block size for members that are alike: as many as vector instructions handle efficiently, if this does not
+    increase the work of a device."""
     if size < 2 * VECTORS:
         return 1
     most = max(VECTORS, min(LANES, NUMBERS // max(unknowns, 1) ** 2))
@@ -213,7 +214,7 @@ def least_lanes(size: int, unknowns: int, hands: int = 1) -> int:
 
 
 def are_alike(dts: Real) -> bool:
-    """Whether members are known to take about as many steps."""
+    """Whether members are known to take about the same number of steps."""
     if not is_concrete(dts):
         return False
     dts = np.asarray(dts)  # inside a jit, what is done to an array of JAX would be traced
@@ -221,7 +222,8 @@ def are_alike(dts: Real) -> bool:
 
 
 def _members(control: Adaptive, trees: PyTree, in_axes) -> int:
-    """How many members a sweep under error control has: as many as there are tolerances, or of what else differs."""
+    """The number of members of a sweep under error control: the number of tolerances, or of other values that
+    differ."""
     if sizes := lengths(jax.tree.leaves(control)):
         return sizes[0]
     for (name, tree), axes in zip(trees.items(), in_axes if isinstance(in_axes, tuple) else (), strict=False):
@@ -265,8 +267,8 @@ def _initial_values(
 
 
 def axis_of_each(axes: PyTree, tree: PyTree) -> list:
-    """For each leaf of `tree` what a prefix of it says, as the axes of `jax.vmap` are; ValueError or TypeError where it
-    is none."""
+    """For each leaf of `tree` the value of a prefix of it, such as the axes of `jax.vmap`; ValueError or TypeError if
+    it is not a prefix."""
     spread = jax.tree.map(lambda axis, part: [axis] * len(jax.tree.leaves(part)), axes, tree, is_leaf=_is_none)
     return jax.tree.leaves(spread, is_leaf=_is_none)
 
@@ -299,13 +301,13 @@ def _is_none(x: PyTree) -> bool:
 
 
 def _member(data: PyTree, mapped: tuple, i: int):
-    """One member's part of the data, or, for an array i, that of several."""
+    """The data of one member; for an array i, those of several."""
     leaves, structure = jax.tree.flatten(data)
     return jax.tree.unflatten(structure, [x[i] if flag else x for x, flag in zip(leaves, mapped, strict=True)])
 
 
 def _require_consistent(system, data: PyTree, mapped: tuple, t0: Real):
-    """An error for the members that are farthest from the constraint, and for the first; tracers pass."""
+    """Raises an error that names the members farthest from the constraint, and the first one; tracers pass."""
     leaves, structure = jax.tree.flatten(data)
     worst = {0}
     if any(mapped):
@@ -325,7 +327,7 @@ def _require_consistent(system, data: PyTree, mapped: tuple, t0: Real):
 
 
 def _warn_of_jumps(params: PyTree, t0: Real, times: np.ndarray, dts: np.ndarray):
-    """A warning where a held input that the members share jumps within a step of one of them."""
+    """Warns if a held input that the members share jumps within a step of one of them."""
     if all_concrete((t0, times, dts)):
         dts = np.unique(np.asarray(dts, float))
         times = np.append(np.asarray(t0, float), np.asarray(times, float))
@@ -339,7 +341,7 @@ def _warn_of_jumps(params: PyTree, t0: Real, times: np.ndarray, dts: np.ndarray)
 
 
 def require_one_grid(stepper: Stepper, duration: Real, num_samples: int | None, times: PyTree):
-    """An error unless the samples are given in one of the two ways, and in one that the stepper can step on."""
+    """Raises an error unless the samples are given in one of the two ways, and the stepper supports it."""
     given = [x is not None for x in (duration, num_samples, times)]
     if given not in ([True, True, False], [False, False, True]):
         raise TypeError(
@@ -368,7 +370,8 @@ def require_step_sizes(dts: PyTree) -> Real:
 
 
 def require_steps_within(dts: Real, start: float, end: Real, num_samples: int | None = None):
-    """An error for step sizes that are not positive, take too many steps, or exceed the distance of equal samples."""
+    """Raises an error for step sizes that are not positive, take too many steps, or exceed the spacing of equal
+    samples."""
     if not all_concrete((dts, start, end)):
         return
     h, span = np.asarray(dts, float), float(end) - float(start)
@@ -387,13 +390,14 @@ def require_steps_within(dts: Real, start: float, end: Real, num_samples: int | 
 
 
 def fit_to_samples(dts: Array, H: Array):
-    """The numbers of steps between two samples, and the step sizes; NaN where a traced dt is not in (0, H]."""
+    """The numbers of steps between two samples, and the step sizes; NaN if a traced dt is not in (0, H]."""
     slack = 64 * float(jnp.finfo(dts.dtype).eps)
     return _fit(dts, H, (dts > 0) & (dts <= H * (1 + 1e-6)), slack)
 
 
 def fit_to_times(dts: Array, times: Array):
-    """The same for each interval, (B, K); NaN where a traced dt is not positive, or a time not after the last."""
+    """As `fit_to_samples`, for each interval, (B, K); NaN if a traced dt is not positive, or a time not after the
+    previous one."""
     H, eps = jnp.diff(times), float(jnp.finfo(dts.dtype).eps)
     increasing = (H > 0) & jnp.isfinite(H)
     H = jnp.where(increasing, H, 1)
@@ -403,7 +407,8 @@ def fit_to_times(dts: Array, times: Array):
 
 
 def may_grow(dts: np.ndarray, t0: Real, times: np.ndarray) -> bool:
-    """Whether steps may be too long behind the one before, as far as all is known: one after a short interval."""
+    """Whether a step may be too long compared with the previous one, as after a short interval; True if it is not
+    known."""
     if not all_concrete((dts, t0, times)):
         return True
     H = np.diff(np.asarray(times, float), prepend=float(t0))
@@ -411,6 +416,6 @@ def may_grow(dts: np.ndarray, t0: Real, times: np.ndarray) -> bool:
 
 
 def _fit(dts: Array, H: Array, fine: Array, slack: Real):
-    """The least numbers of steps in H that are no longer than dts, but for the slack, and their sizes."""
+    """The smallest numbers of steps in H that are not longer than dts, up to a slack, and their sizes."""
     substeps = jnp.maximum(jnp.ceil(H / jnp.where(fine, dts, H) * (1 - slack)), 1).astype(jnp.int32)
     return substeps, jnp.where(fine, H / substeps.astype(dts.dtype), jnp.nan)

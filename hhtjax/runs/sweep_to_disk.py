@@ -1,4 +1,5 @@
-"""Sweeps, and functions of many members, that are written to disk as they go, and taken up again where they stopped."""
+"""Sweeps, and functions of many members, that are written to disk in chunks and can be continued after an
+interruption."""
 
 from __future__ import annotations
 
@@ -68,20 +69,20 @@ def sweep_to_disk(
     retries: int = RETRIES,
     format: str = "npz",
 ) -> Path:
-    """The same as `sweep`, `chunk` members at a time, each chunk written to a file of its own in `folder`.
+    """A `sweep` that processes `chunk` members at a time, and writes each chunk to its own file in `folder`.
 
-    chunk-00000.npz, ... hold the leaves of the `Solution` by name ("q", "dt", "failure.step", ...), members first;
-    manifest.json the numbers of members and chunks, versions, and a hash of the inputs: of all values, and of the
-    program that XLA is given, so that a changed force is noticed too. A file appears with its whole content or not at
-    all. A sweep that was interrupted, at whatever moment, is continued by the same call, and ends with the same files.
+    The files chunk-00000.npz, ... hold the leaves of the `Solution` by name ("q", "dt", "failure.step", ...), with
+    members first. manifest.json holds the numbers of members and chunks, versions, and a hash of the inputs. The hash
+    covers all values and the program given to XLA, so a changed force is noticed too. A file appears complete or not at
+    all. If a sweep is interrupted, at any moment, repeat the call: it continues, and ends with the same files.
 
-    With an executor its workers run the chunks and write the files, in any order: they need the folder, hhtjax and the
-    same JAX, and compile once each. The values are those without one, bit by bit on processors of one kind. Several
-    calls with the same inputs may write to one folder at a time.
+    With an executor, its workers run the chunks and write the files, in any order. They need access to the folder,
+    hhtjax and the same version of JAX. Each worker compiles once. The values are the same as without an executor, bit
+    by bit on processors of one kind. Several calls with the same inputs may write to one folder at the same time.
 
     Args:
-        folder: made if it does not exist.
-        chunk: members in a file at most, which bounds the memory.
+        folder: created if it does not exist.
+        chunk: largest number of members in a file, which limits the memory.
         progress: one line on stderr, rewritten with each file.
         executor: any `concurrent.futures.Executor`, as for `parallel_map`. None: this process.
         in_flight, retries: as for `parallel_map`.
@@ -91,12 +92,13 @@ def sweep_to_disk(
             keep_events, output: those of `sweep`; `dts` also `adaptive(...)`.
 
     Returns:
-        The folder, to be read by `load_sweep`, or by `numpy.load` file by file.
+        The folder. Read it by `load_sweep`, or file by file by `numpy.load`.
 
     Raises:
-        ValueError: the folder holds a sweep of other inputs or versions.
-        OSError: a file cannot be written, such as on a full disk; those before it stay, and the same call goes on.
-        RuntimeError: of an executor: members failed, or a worker died; files stay, and the same call goes on.
+        ValueError: the folder holds a sweep with other inputs or versions.
+        OSError: a file cannot be written, for example because the disk is full. Earlier files stay, and the same call
+            continues.
+        RuntimeError: with an executor: members failed, or a worker died. Files stay, and the same call continues.
         TypeError, ValueError, NotImplementedError: as `sweep` and `parallel_map`; also for tracers.
 
     >>> import tempfile, jax.numpy as jnp, hhtjax
@@ -115,7 +117,7 @@ def sweep_to_disk(
     inputs = Inputs.checked(system, stepper, q0, v0, params, z0=z0, dts=dts, in_axes=in_axes, **grid)
     inputs = inputs.with_events(events, max_events, keep_events)._replace(output=require_output(caller, output))
     if not all_concrete(inputs):
-        raise TypeError("sweep_to_disk: all arguments must be known: call it outside jit, vmap and grad.")
+        raise TypeError("sweep_to_disk: arguments must not be tracers: call it outside jit, vmap and grad.")
     hands = require_executor(caller, executor, in_flight, retries, progress)
     require_one_of(caller, "format", format, FORMATS)
     by_errors = isinstance(inputs.dts, Adaptive)
@@ -138,22 +140,22 @@ def map_to_disk(
     progress: bool = False,
     format: str = "npz",
 ) -> Path:
-    """`parallel_map`, each chunk written to a file of its own in `folder`: for what takes hours, or more than memory.
+    """`parallel_map` that writes each chunk to its own file in `folder`, for long work or results larger than memory.
 
-    Interrupted at any moment, it is continued by the same call. Files are as those of `sweep_to_disk`, by the names of
-    the leaves of what f returns: "a.b" of {"a": {"b": ...}}, "result" of an array by itself.
+    If it is interrupted, at any moment, repeat the call: it continues. Files are like those of `sweep_to_disk`, with
+    the names of the leaves that f returns: "a.b" for {"a": {"b": ...}}, "result" for a single array.
 
     Args:
-        folder: made if it does not exist.
+        folder: created if it does not exist.
         format: as for `sweep_to_disk`.
         f, arguments, executor, chunk, in_axes, in_flight, retries, progress: those of `parallel_map`.
 
     Returns:
-        The folder, to be read by `load_sweep`.
+        The folder, for `load_sweep`.
 
     Raises:
-        ValueError: the folder holds something of other inputs or versions.
-        OSError: a file cannot be written; those before it stay, and the same call goes on.
+        ValueError: the folder holds results of other inputs or versions.
+        OSError: a file cannot be written. Earlier files stay, and the same call continues.
         TypeError, ValueError, NotImplementedError, RuntimeError: as `parallel_map`.
 
     >>> import tempfile, jax.numpy as jnp, hhtjax
@@ -180,8 +182,8 @@ def _store(
     axis: str | None = None,
     length: int = 0,
 ) -> Path:
-    """Writes what is not there yet. shortened: names of arrays whose last axis ends with the most steps of a chunk;
-    axis: the name of second axes of this length."""
+    """Writes the chunks that are missing. shortened: names of arrays whose last axis is cut to the largest number of
+    steps in a chunk; axis: the name of second axes of this length."""
     chunks, paths = work.chunks, jax.tree_util.tree_leaves_with_path(work.like())
     names = Names(tuple(jax.tree_util.keystr(path, simple=True, separator=".") or "result" for path, _ in paths))
     like = [x for _, x in paths]
@@ -214,18 +216,19 @@ def _store(
         hands.work(written, chunks, left, arguments, lambda k, result: None)
         if lost := store.missing(left):
             raise RuntimeError(
-                f"{caller}: workers wrote {len(lost)} chunks that are not in {folder}: all have to see one folder."
+                f"{caller}: workers wrote {len(lost)} chunks that are not in {folder}: all must have access to the "
+                "same folder."
             )
     store.end()
     return folder
 
 
 def _require_names(caller: str, names: tuple[str, ...], like: list):
-    """An error for results that files cannot hold by their names, or at all."""
+    """Raises an error for results that files cannot hold under their names, or at all."""
     for name, x in zip(names, like, strict=True):
         if names.count(name) > 1 or name in RESERVED or "/" in name:
             raise ValueError(
-                f"{caller}: results must have names of their own, without '/', and not {', '.join(RESERVED)}; received "
+                f"{caller}: results must have unique names, without '/', and not {', '.join(RESERVED)}; received "
                 f"{name!r}."
             )
         if x.dtype.kind not in "biufc":
@@ -233,14 +236,14 @@ def _require_names(caller: str, names: tuple[str, ...], like: list):
 
 
 def _dims(name: str, shape: tuple, axis: str | None, length: int) -> tuple[str, ...]:
-    """Names of the axes behind that of the members."""
+    """Names of the axes after the axis of members."""
     names = [f"{name}_{i}" for i in range(1, len(shape))]
     is_sampled = shape[1:2] == (length,) and not name.startswith(("dt", "steps", "events", "failure"))
     return (axis, *names[1:]) if axis and is_sampled else tuple(names)
 
 
 def _hash(work: Work) -> str:
-    """Of the program and all that it is called with."""
+    """The hash of the program and all its arguments."""
     digest = hashlib.sha256(work.text().encode())
     for x in [*work.shared, *work.own(np.arange(work.chunks.size))]:
         x = np.ascontiguousarray(x)
@@ -278,7 +281,7 @@ def _work(inputs: Inputs, chunk: int) -> Work:
 
 @dataclass(frozen=True)
 class _Swept:
-    """The `Solution` of a chunk. rest: what of `Inputs` are no arrays; static: keywords of `run_sweep`."""
+    """The `Solution` of a chunk. rest: the parts of `Inputs` that are not arrays; static: keywords of `run_sweep`."""
 
     structure: Any
     mapped: tuple

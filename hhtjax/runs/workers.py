@@ -1,7 +1,8 @@
-"""What a worker of an executor does: it keeps programs, each compiled once, and runs them on the arrays it is sent.
+"""The part that runs on the workers of an executor: it compiles each program once, and runs it on the arrays it
+receives.
 
-A program crosses as what `jax.export` makes of it. Nothing of the user's has to be importable on a worker, which needs
-hhtjax and the same JAX.
+A program is sent in the form that `jax.export` produces. No code of the user needs to be importable on a worker, which
+needs hhtjax and the same version of JAX.
 """
 
 from __future__ import annotations
@@ -30,11 +31,12 @@ _lock = threading.Lock()
 
 
 class Unfit(RuntimeError):
-    """A worker that cannot run what it is sent, however often it is asked."""
+    """A worker cannot run what it receives; trying again would not help."""
 
 
 class Packed(NamedTuple):
-    """A program on its way. key: its hash, by which a worker knows it; shared: arrays that it takes for all chunks."""
+    """A program to be sent. key: its hash, by which a worker identifies it; shared: arrays that it uses for all
+    chunks."""
 
     key: str
     content: bytes
@@ -50,12 +52,12 @@ class _Content(NamedTuple):
 
 
 def versions() -> dict[str, str]:
-    """Of what has to be the same on both sides."""
+    """The versions that must be the same on both sides."""
     return {"hhtjax": VERSION, "jax": version("jax")}
 
 
 def packed(exported: jax.export.Exported, shared: list, options: dict) -> Packed:
-    """A program of lists, (shared, own) -> leaves, with the first of them."""
+    """The program of a function of lists, (shared, own) -> leaves, together with `shared`."""
     x64, platform = jnp.result_type(float) == np.float64, exported.platforms[0]
     content = _Content(bytes(exported.serialize()), options, x64, platform, versions())
     data = zlib.compress(pickle.dumps(tuple(content)))
@@ -63,18 +65,18 @@ def packed(exported: jax.export.Exported, shared: list, options: dict) -> Packed
 
 
 def results(program: Packed, own: list, ticket: Any) -> list[np.ndarray]:
-    """On a worker: what the program makes of the arrays of a chunk. ticket: makes one task differ from another, since
-    Dask takes two that are equal for one."""
+    """Runs on a worker: the results of the program for the arrays of a chunk. ticket: makes tasks different from each
+    other, because Dask runs equal tasks only once."""
     return _here(program)(program.shared, own)
 
 
 def written(program: Packed, own: list, ticket: Any, write: Callable[[list], None]):
-    """The same, handed to a function that writes it where the worker is."""
+    """As `run`, with the results passed to a function that writes them on the worker."""
     write(results(program, own, ticket))
 
 
 def _here(program: Packed) -> Callable:
-    """It, compiled in this process; threads wait for one of them to do so."""
+    """The program, compiled in this process; if several threads need it, one compiles and the others wait."""
     if os.getpid() != IMPORTED_BY:
         raise Unfit(
             "a worker process was forked from one that had loaded JAX, which does not work: make the executor with "
@@ -90,7 +92,7 @@ def _here(program: Packed) -> Callable:
 
 
 def _compiled(content: _Content) -> Callable:
-    """Shared arrays and those of a chunk -> results."""
+    """The function (shared arrays, arrays of a chunk) -> results."""
     if content.versions != versions():
         raise Unfit(f"a worker must have the caller's versions, {content.versions}; it has {versions()}.")
     if (platform := jax.export.default_export_platform()) != content.platform:
@@ -112,7 +114,7 @@ def _compiled(content: _Content) -> Callable:
 
 
 def _bits(x64: bool):
-    """A context in which JAX has 64 bits, or not, by the name that this JAX has for it."""
+    """A context in which JAX has 64 bits, or not, under the name that this version of JAX uses."""
     if hasattr(jax, "enable_x64"):
         return jax.enable_x64(x64)
     from jax.experimental import enable_x64  # type: ignore[attr-defined]

@@ -1,4 +1,5 @@
-"""Results of many members as one Zarr store with named dimensions, which xarray opens and many processes write to."""
+"""Results of many members as one Zarr store with named dimensions, which xarray can open; many processes may write to
+it."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ WRITTEN = "chunk_written"  # an array beside the others: which chunks are there
 
 
 class Zarr(NamedTuple):
-    """A Zarr store. dims: names of the axes of each array behind that of the members."""
+    """A Zarr store. dims: names of the axes of each array after the axis of members."""
 
     caller: str
     folder: Path
@@ -29,16 +30,16 @@ class Zarr(NamedTuple):
     length: int
 
     def left(self, chunks: int) -> list[int]:
-        """Which are not there yet."""
+        """The chunks that are missing."""
         written = np.asarray(open_zarr(self.caller, self.folder)[WRITTEN][:])
         return [k for k in range(chunks) if not written[k]]
 
     def missing(self, these: Sequence[int]) -> list[int]:
-        """Which of those that were written are not here."""
+        """Those of the written chunks that are not in the store."""
         return sorted(set(these) & set(self.left(max(these) + 1)))
 
     def write(self, k: int, kept: int, arrays: Sequence[np.ndarray]):
-        """The arrays of a chunk, and then that they are there."""
+        """Writes the arrays of a chunk, and then the flag that they exist."""
         group, start = open_zarr(self.caller, self.folder, "r+"), k * self.length
         try:
             for name, x in zip(self.names.all, arrays, strict=True):
@@ -47,12 +48,12 @@ class Zarr(NamedTuple):
         except OSError as error:
             raise OSError(
                 error.errno,
-                f"{self.caller}: chunk {k} could not be written to {self.folder} ({error.strerror}); those before it "
-                "are whole: make room, and repeat the call, which goes on where it stopped",
+                f"{self.caller}: chunk {k} could not be written to {self.folder} ({error.strerror}); earlier ones "
+                "are complete: free some space, and repeat the call, which continues where it stopped",
             ) from error
 
     def begin(self, manifest: dict[str, Any], like: Sequence[Any]):
-        """Makes the arrays, or compares the manifest with the one that is there."""
+        """Creates the arrays, or compares the manifest with the existing one."""
         if (self.folder / "zarr.json").exists():
             found = open_zarr(self.caller, self.folder).attrs.get(ATTRIBUTE) or {}
             return require_same(self.caller, self.folder, found, manifest)
@@ -91,11 +92,12 @@ class Zarr(NamedTuple):
             self.begin(manifest, like)
 
     def end(self):
-        """Nothing is left over."""
+        """Nothing to do: no temporary files exist."""
 
 
 def _consolidate(group: Any):
-    """All metadata in one file, which xarray looks for; Zarr warns that its format 3 does not have it yet."""
+    """Collects all metadata in one file, which xarray looks for. Zarr warns that this is not yet part of its format
+    3."""
     import zarr
 
     with warnings.catch_warnings():
@@ -115,13 +117,13 @@ def open_zarr(caller: str, folder: Path, mode: Any = "r") -> Any:
 
 
 def zarr_arrays(folder: Path, lazy: bool) -> dict[str, Any]:
-    """What a Zarr store of ours holds."""
+    """The contents of a Zarr store that this library wrote."""
     group = open_zarr("load_sweep", folder)
     written = np.asarray(group[WRITTEN][:])
     if not written.all():
         raise FileNotFoundError(
             f"load_sweep: {np.sum(~written)} of {len(written)} chunks are missing in {folder}, the first is number "
-            f"{int(np.argmin(written))}: repeat the call that wrote it, which goes on where it stopped."
+            f"{int(np.argmin(written))}: repeat the call that wrote it, which continues where it stopped."
         )
     arrays = {name: x for name, x in group.arrays() if name != WRITTEN}
     return arrays if lazy else {name: x[:] for name, x in arrays.items()}

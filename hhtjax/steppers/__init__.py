@@ -1,21 +1,21 @@
-"""Steppers: one step of size h, in as many ways as there are files here.
+"""Time-stepping methods.
 
 =================================  ====================  ================  ==========================================
 stepper                            order                 solves per step   for
 =================================  ====================  ================  ==========================================
 `hht(alpha=-0.05)`                 2                     1                 stiff mechanics; the default. `linearize=`
-                                                                           picks the point of linearisation
+                                                                           sets the point of linearisation
 `hht(alpha, iterations=None)`      2                     Newton's          the converged method, differentiated
                                                                            implicitly
-`newmark(beta, gamma)`             2; 1 for gamma > 1/2  1, or Newton's    the family's ancestor, same options
-`bossak(alpha)`                    2                     1, or Newton's    the rest of the family, same options
-`generalized_alpha(rho_inf)`       2                     1, or Newton's    the rest of the family, same options
+`newmark(beta, gamma)`             2; 1 for gamma > 1/2  1, or Newton's    origin of the family, same options
+`bossak(alpha)`                    2                     1, or Newton's    same family, same options
+`generalized_alpha(rho_inf)`       2                     1, or Newton's    same family, same options
 `kim_hht(alpha)`                   1; 2 for alpha = 0    1                 the paper of 2019, literally
-`conventional_hht(alpha)`          1; 2 for alpha = 0    Newton's          what it compares with, literally
-`kim_implicit_euler()`             1                     1                 what it compares with, literally
+`conventional_hht(alpha)`          1; 2 for alpha = 0    Newton's          its comparison, literally
+`kim_implicit_euler()`             1                     1                 its comparison, literally
 `rosenbrock(rho_inf=0)`            2                     2                 one factorisation; L-stable
 `rowda()`                          3                     4                 one factorisation; L-stable: for accuracy
-`rodas5p()`                        5                     8                 the same to six digits and more, with a
+`rodas5p()`                        5                     8                 six digits or more, stiff, with a
                                                                            tolerance, `adaptive`
 `extrapolated()`                   5                     15                six digits or more, stiff, with constraints
 `houbolt()`                        2                     Newton's          a classical baseline
@@ -25,43 +25,44 @@ stepper                            order                 solves per step   for
 `operator_splitting(alpha)`        2 for constant M and  1, no Jacobian    a baseline
                                    damping, else 1
 `implicit_euler()`                 1                     Newton's          robustness
-`rk4()`                            4                     explicit          where nothing is stiff
-`dopri5()`, `tsit5()`              5                     explicit          the same with a tolerance, `adaptive`
-`dop853()`                         8                     explicit          the same to eight digits and more
-`taylor(order)`                    any                   explicit          the same, quicker, for functions that have
+`rk4()`                            4                     explicit          motion that is not stiff
+`dopri5()`, `tsit5()`              5                     explicit          not stiff, with a tolerance, `adaptive`
+`dop853()`                         8                     explicit          not stiff, eight digits and more
+`taylor(order)`                    any                   explicit          not stiff, faster, for functions that have
                                                                            Taylor series
 =================================  ====================  ================  ==========================================
 
-All of them also take a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`: the solution's `q` is y.
-Only the `hht` family and `extrapolated` take constraints and rotations; `conventional_hht` does too, as its authors
-printed it. Internal states are for the `hht` family, `extrapolated`, Rosenbrock and Runge-Kutta methods and `taylor`.
-Dry friction and contact are for the `hht` family, to which `implicit_euler` belongs in all of this but for error
+All of them also solve a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`; the solution's `q` is
+y. Constraints and rotations: the `hht` family and `extrapolated`; also `conventional_hht`, in the form its authors
+printed. Internal states: the `hht` family, `extrapolated`, Rosenbrock and Runge-Kutta methods and `taylor`. Dry
+friction and contact: the `hht` family. `implicit_euler` supports the same features as the `hht` family, except error
 control.
 
-Some words: a motion is stiff if it contains vibrations or decays much faster than what one wants to see, such as those
-of stiff springs. A method is A-stable if no step size makes a decaying linear motion grow, and L-stable if besides it
-takes the infinitely fast ones out at once. Its order is the power of h with which its error falls. Numerical damping is
-what a method takes out of a vibration that has none; its spectral radius, the factor that is left after one step.
-Non-iterative means that the nonlinear equations of an implicit step are solved by one step of Newton's iteration, about
-a point of linearisation that is cheap and good enough: which is best is measured by
-`python -m experiments linearization`.
+Some terms. A motion is stiff if it contains vibrations or decays much faster than those of interest, such as those of
+stiff springs. A method is A-stable if no step size makes a decaying linear motion grow. It is L-stable if it also
+removes infinitely fast decays at once. Its order is the power of h with which its error falls. Numerical damping is the
+energy that a method removes from an undamped vibration; the spectral radius is the factor by which one step reduces the
+amplitude. Non-iterative means that the nonlinear equations of an implicit step are solved by a single Newton step,
+about a point of linearisation that is cheap and accurate enough. `python -m experiments linearization` measures which
+point is best.
 
 Which one
 ---------
 
-Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is quicker, and with a tolerance `taylor()`,
-or `tsit5()` where a function has no Taylor series. If five digits or more are wanted of something stiff, take
-`rodas5p()`, with constraints or rotations `extrapolated()` and a tolerance, or `simulate(..., extrapolate=2)`. For
-fitting by gradients take `hht(linearize="predictor")`, which is smooth in all that can be differentiated. If steps are
-to be far longer than the fastest vibration and the run blows up, try `hht(linearize="held")`, more damping
-(`alpha=-0.3`), or `hht(iterations=None)`. Where each of them fails is on one page, `experiments/stability/README.md`,
-and what became of the tables and figures of the paper of 2019 on another, `experiments/kim2019/README.md`.
+Start with `hht()`. If the motion is smooth and nothing is stiff, `rk4()` is faster. With a tolerance use `taylor()`, or
+`tsit5()` if a function has no Taylor series. For five digits or more of a stiff motion use `rodas5p()`; with
+constraints or rotations use `extrapolated()` with a tolerance, or `simulate(..., extrapolate=2)`. For fitting by
+gradients use `hht(linearize="predictor")`, which is smooth in everything that can be differentiated. If steps must be
+far longer than the fastest vibration and the run blows up, try `hht(linearize="held")`, more damping (`alpha=-0.3`), or
+`hht(iterations=None)`. The page `experiments/stability/README.md` shows where each method fails, and
+`experiments/kim2019/README.md` repeats the tables and figures of the paper of 2019.
 
 How long a step
 ---------------
 
-`hhtjax.analysis.suggest_step_size` reads the modes of the linearised system, or, with `duration=`, makes short runs
-until the motion itself is within the tolerance. Whatever is chosen, a sweep over step sizes shows what it does:
+`hhtjax.analysis.suggest_step_size` lists the modes of the linearised system and a step that resolves them. With
+`duration=` it makes short runs until the motion itself is within the tolerance. To check a step, run a sweep over step
+sizes:
 
 >>> import jax.numpy as jnp, hhtjax
 >>> oscillator = hhtjax.LinearSystem(M=jnp.ones(1), K=jnp.full(1, 100.0))
@@ -76,11 +77,11 @@ resolves the mode at 10 rad/s to 0.001
 A stepper of your own
 ---------------------
 
-A family is a frozen dataclass that derives from `Stepper` and has three things, on vectors q, v of a flat system: its
-`order`; `begin`, the `State` at the start; and `bind`, which does once what is constant and returns the function State
--> (State, Info) of one step. Everything else (pytrees, runs, sweeps, gradients, analysis, fits) then works with it.
-First-order and internal states are rates without positions, behind the others in v and w; `system.move` leaves them
-out, and a family that knows them sets `solves_internal = True`.
+A method is a frozen dataclass derived from `Stepper`. It needs three members, which work on vectors q, v of a flat
+system: its `order`; `begin`, which returns the `State` at the start; and `bind`, which does what is constant once and
+returns the function State -> (State, Info) of one step. Everything else (pytrees, runs, sweeps, gradients, analysis,
+fits) then works with it. First-order and internal states are rates without positions; they follow the other entries in
+v and w, and `system.move` leaves them out. A method that supports them sets `solves_internal = True`.
 
 >>> from dataclasses import dataclass
 >>> from hhtjax import Info, State, Stepper
@@ -99,10 +100,11 @@ out, and a family that knows them sets `solves_internal = True`.
 >>> abs(float(run.q[-1, 0] - jnp.cos(10.0))) < 5e-3
 True
 
-A method that remembers something of the size of the last step has a `resized`, too, as in `variable_step.py`.
+A method whose state depends on the size of the last step also has a `resized`, as in `variable_step.py`.
 
-An explicit Runge-Kutta method is its numbers, an `ExplicitTableau`, and a Rosenbrock method a `RosenbrockTableau`:
-with those of an error and of dense output, where it has them, all runs and gradients work as with those of the library.
+An explicit Runge-Kutta method is defined by its coefficients, an `ExplicitTableau`, and a Rosenbrock method by a
+`RosenbrockTableau`. With coefficients for an error estimate and for dense output, all runs and gradients work as with
+the built-in methods.
 
 >>> from hhtjax.steppers import ExplicitTableau, RungeKutta
 >>> kutta = RungeKutta(ExplicitTableau("Kutta", A=((0.5,), (-1.0, 2.0)), b=(1 / 6, 2 / 3, 1 / 6)), order=3)
@@ -110,12 +112,12 @@ with those of an error and of dense output, where it has them, all runs and grad
 >>> abs(float(run.q[-1, 0] - jnp.cos(10.0))) < 1e-6
 True
 
-A method of the generalised-alpha kind needs less: another set of coefficients, or another `advance`, as in
-`implicit_euler`. Add a new family to `STEPPERS` in `tests/zoo.py`, and its order, derivatives, dtypes, batches and
-refusals are tested on the problems there; what is its own gets a test with a closed form.
+A method of the generalised-alpha kind only needs another set of coefficients, or another `advance`, as in
+`implicit_euler`. Add a new method to `STEPPERS` in `tests/zoo.py`: its order, derivatives, dtypes, batches and error
+messages are then tested on the problems there. Test its own features against a closed form.
 
 For error control, `simulate(..., dt=adaptive(...))`, a method also has an `estimate_order` k, a `begin_estimates`, and
-a `bind_estimated`, whose step returns the errors, of size h^k, too (`variable_step.py`).
+a `bind_estimated`, whose step also returns the errors, of size h^k (`variable_step.py`).
 
 Sources
 -------
@@ -124,8 +126,8 @@ Sources
 * H. Hilber, T. Hughes, R. Taylor, Earthquake Eng. Struct. Dyn. 5 (1977) 283-292: `hht`.
 * M. Kim et al., J. Mech. Sci. Tech. 33 (2019) 1087-1096: the non-iterative step; `kim_hht`, `conventional_hht`.
 * M. Arnold, O. Bruls, Multibody Syst. Dyn. 18 (2007) 185-202: second order with M(q) and constraints.
-* K. Jansen, C. Whiting, G. Hulbert, Comput. Methods Appl. Mech. Eng. 190 (2000) 305-319: first-order systems;
-  so are internal states solved.
+* K. Jansen, C. Whiting, G. Hulbert, Comput. Methods Appl. Mech. Eng. 190 (2000) 305-319: first-order systems,
+  and internal states.
 * W. Wood, M. Bossak, O. Zienkiewicz, Int. J. Numer. Methods Eng. 15 (1980) 1562-1566: `bossak`.
 * J. Chung, G. Hulbert, J. Appl. Mech. 60 (1993) 371-375: `generalized_alpha`.
 * A. Cardona, M. Geradin, Computers & Structures 33 (1989) 801-820: constraints and rotations.

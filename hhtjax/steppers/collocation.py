@@ -1,4 +1,4 @@
-"""Collocation methods: the equation of motion holds at t + theta h, beyond the end of the step. Baselines.
+"""Collocation methods: the equation of motion holds at t + theta h, beyond the end of the step. Classical baselines.
 
 The formulas are those of `collocation`; theta = 1 is Newmark's method.
 
@@ -33,11 +33,11 @@ def newmark_step(system: FlatSystem, s: State, h: Array, w: Array, beta: Real) -
 
 
 class Beginning(GeneralizedAlpha):
-    """Newmark's method, as far as the start of a collocation method is that of one.
+    """Newmark's method, used for the start of a collocation method.
 
-    w+ = (1 - 4 R^3 + 3 R^4) M^-1 Q, which is (1 - R)^2 (1 + 2 R + 3 R^2): of a stiff damper h w+ falls to 0 faster
-    than by 1 - R^5. With that a step that half resolves a layer leaves 5e-3 of F/k (1 - 50 q - 5 v from rest), with
-    this 7e-4; the best of all starts, which knows the solution, 3e-4."""
+    w+ = (1 - 4 R^3 + 3 R^4) M^-1 Q, which is (1 - R)^2 (1 + 2 R + 3 R^2) M^-1 Q. For a stiff damper h w+ falls to 0
+    faster than with 1 - R^5. For a step that half resolves a layer, 1 - R^5 leaves an error of 5e-3 of F/k (1 - 50 q -
+    5 v from rest), this formula 7e-4, and the best possible start, which uses the solution, 3e-4."""
 
     corrections = Corrections(4, -3.0)
 
@@ -65,26 +65,26 @@ class Collocation(Stepper):
         resolves: bool = False,
         alone: bool = False,
     ) -> State:
-        """The state from which the first step goes, as of the `hht` family, but for 2 theta h."""
+        """The state from which the first step starts, as in the `hht` family, for the step 2 theta h."""
         dt = 2 * self.theta * dt
         return self.beginning.smoothed(system, state, params, dt, moves, resolves, alone)._replace(a=None)
 
     def jumped(self, system: FlatSystem, before, after, old, new, dt: Array, answer):
-        """The same where held inputs jump."""
+        """The state after a jump of held inputs."""
         return self.beginning.jumped(system, before, after, old, new, 2 * self.theta * dt, answer)
 
     def throws(self, system):
-        """Unless there are no positions."""
+        """True if there are positions."""
         return system.positions > 0
 
     def grown(self, system: FlatSystem, state, params: PyTree, dt: Array):
-        """As of the `hht` family."""
+        """As in the `hht` family."""
         lagging = state._replace(a=state.w)
         return self.beginning.grown(system, lagging, params, 2 * self.theta * dt)._replace(a=None)
 
     @property
     def beginning(self) -> Beginning:
-        """Of runs, and behind jumps."""
+        """The method for the start of runs, and after jumps."""
         return Beginning(Coefficients(0.0, 0.0, self.beta, 0.5), 2, self.options)
 
     def bind(self, system: FlatSystem, params: PyTree, dt: Array):
@@ -115,8 +115,8 @@ def collocation(beta: Any, theta: Any, tolerance: Real = 1e-10, max_iterations: 
 
         theta/(2 (theta + 1)) >= beta >= (2 theta^2 - 1)/(4 (2 theta^3 - 1))
 
-    From w = M^-1 Q with a step far beyond a period, the first q1 overshoots by the square of h: so runs begin as those
-    of `hht` do.
+    If a run started from w = M^-1 Q with a step far longer than a period, the first q1 would overshoot by a factor of
+    order h^2. Runs therefore start as those of `hht` do.
 
     Args:
         beta: in (0, 1/4]; theta: 1 or more; numbers, or tracers to differentiate.
@@ -141,8 +141,9 @@ def collocation(beta: Any, theta: Any, tolerance: Real = 1e-10, max_iterations: 
 def wilson(theta: Real = 1.4, tolerance: Real = 1e-10, max_iterations: int = 20) -> Collocation:
     """Wilson's theta method: acceleration linear in time up to t + theta h, where the equation of motion holds.
 
-    `collocation` with beta = 1/6. Order 2. Unconditionally stable for theta >= 1.366, where 2 theta^2 - 2 theta >= 1.
-    Started away from rest with a step far beyond a period 2 pi/omega, q1 = q [1 - (omega h)^2 (1 - 1/theta)/2].
+    This is `collocation` with beta = 1/6. Order 2. Unconditionally stable for theta >= 1.366, where 2 theta^2 - 2 theta
+    >= 1. A start away from rest with a step far longer than a period 2 pi/omega gives q1 = q [1 - (omega h)^2 (1 -
+    1/theta)/2].
 
     Args:
         theta: 1 or more.

@@ -1,13 +1,13 @@
 """The generalised-alpha step with constraints, in index-3 form and stabilised (GGL).
 
-The residual of the step gets the rows of the constraints, scaled so that all are of one size for every h:
+The residual of the step gets rows for the constraints, scaled so that their size does not depend on h:
 
     r(w1, L1, eta) = [ M(q1) w1 - Q1 - B1^T L1;  Phi(q1, t1)/(beta h^2);  (B1 v1 + Phi_t)/(gamma h) ]
     q1 = (Newmark's) - beta h^2 D eta,    D = diag(M_n)^-1 B_n^T
 
 Index 3 has neither the last row nor eta. With both, velocities satisfy their constraint too, and the spectrum at
-infinite frequency has no Jordan block: multipliers do not grow even for the trapezoidal rule. Any weights in D will
-do; the diagonal of M keeps units apart, costs no solve, and on the squeezer gave 10 % less error than M.
+infinite frequency has no Jordan block, so multipliers do not grow even with the trapezoidal rule. D may have any
+weights. The diagonal of M separates units, needs no solve, and gave 10 % less error on the squeezer than M.
 
 C. Gear, B. Leimkuhler, G. Gupta, J. Comput. Appl. Math. 12-13, 1985; A. Cardona, M. Geradin, Computers & Structures 33,
 1989; M. Arnold, O. Bruls, Multibody Syst. Dyn. 18, 2007.
@@ -63,9 +63,10 @@ def sparse_directions(system: FlatSystem, params: PyTree, s: State):
 
 
 def equations(method, system, params: PyTree, dt, s):
-    """The residual of a step from s as a function of the state, the state as one of z = (w, L, eta), and z to start at.
+    """The residual of a step from s as a function of the state, the state as a function of z = (w, L, eta), and the
+    initial z.
 
-    Also what eta takes off the displacement, as a function, and B at the start.
+    Also the correction of the displacement by eta, as a function, and B at the start.
     """
     c, n, m = method.coefficients, system.size, system.num_constraints
     ggl = method.options.formulation == "ggl"
@@ -117,10 +118,10 @@ def bind_constrained(method, system, params: PyTree, dt: Array):
 
 
 def report_constraints(method, system, params, dt, s, s1, info, B):
-    """What the step tells about them: violations, and the row that depends on others."""
+    """The report of constraints: violations, and the first dependent row."""
 
     def dependent() -> Array:
-        """At the start; if the step failed, at its predicted end."""
+        """The row at the start; if the step failed, at its predicted end."""
         worked = jnp.all(jnp.isfinite(s1.w))
         predicted = method.arrive(system, s, dt, s.w)
         if B is None:

@@ -1,16 +1,16 @@
-"""The generalised-alpha step with contacts: closed ones are modes of it, and it is divided where one switches.
+"""The generalised-alpha step with contacts. Closed contacts are modes of the step, which is divided where one switches.
 
-The residual holds the contact forces f0 of the start of the step; what they change by is answered linearly,
+The residual contains the contact forces f0 of the start of the step. The effect of their change df is linear,
 
     w1 = wf + G df,    G = A^-1 J^T,    y1 = yf + h gamma' K df,    K = J G,
 
-f standing for the free step, with f0, and gamma' = gamma (1 - alpha_f)/(1 - alpha_m). The modes of contacts give df
-(contact_modes.py). Behind it q, v, w and a go along G to where the modes have them: gaps to 0, rates of what is held to
-0, and accelerations to those of the forces.
+where the suffix f denotes the free step, with f0, and gamma' = gamma (1 - alpha_f)/(1 - alpha_m). The modes of contacts
+determine df (contact_modes.py). Then q, v, w and a are moved along G to satisfy the modes: gaps become 0, rates of held
+contacts become 0, and accelerations agree with the forces.
 
-A step in which somebody lets go, breaks away, stops or lands is taken again, up to there; behind that instant
-accelerations and forces begin anew (contact_instant.py), with velocities behind an impact, and the rest of the step
-follows. When it happens is a function of both ends of the step tried first, with derivatives.
+If a contact separates, starts to slide, stops or lands within the step, the step is taken again, up to that instant.
+There accelerations and forces start anew (contact_instant.py), with the velocities after an impact, and the rest of the
+step follows. The instant is a differentiable function of both ends of the step that was tried first.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def bind_contact(method, system: FlatSystem, params: PyTree, dt: Array):
 
 
 class Way(NamedTuple):
-    """What is left of a step: from `start`, of the size `rest`; the next part has the size `aim`, and ends with a
-    switch, if there is one. end: of the whole, once it is `done`."""
+    """The remainder of a step: from `start`, of size `rest`. The next part has the size `aim`, and ends with a switch,
+    if there is one. end: of the whole step, once it is `done`."""
 
     start: Any
     rest: Array
@@ -99,7 +99,7 @@ def _in_parts(method, system: FlatSystem, params: PyTree, found: tuple, s: State
 
 
 def _go_on(method, system: FlatSystem, params: PyTree, way: Way, h: Array) -> Way:
-    """The next part of a step h: to its end, or, if somebody switches before, a shorter one to be tried next."""
+    """The next part of a step h: to its end, or, if a contact switches before, a shorter one to be tried next."""
     s, aim = way.start, way.aim
     short = h * math.sqrt(float(jnp.finfo(h.dtype).eps))
     size = jnp.maximum(aim, short)
@@ -147,7 +147,7 @@ def _part(method, system: FlatSystem, params: PyTree, s: State, h: Array):
     held, roundings = modes.held(mu), _roundings(s1, J, K, f0 + df, h)
 
     def taken_off(rates: Array) -> Array:
-        """What takes these off where they are held."""
+        """The change of forces that makes these values 0 where they are held."""
         return product(G, forces(jnp.where(held, rates, 0)))
 
     q = system.move(s.q, _closed_up(system, params, s, x, h, held, taken_off, roundings[0]))
@@ -174,7 +174,7 @@ def _closed_up(
     taken_off: Callable,
     of_gap: Array,
 ) -> Array:
-    """The displacement x with the gaps of closed contacts at 0, and what sticks where it was."""
+    """The displacement x, corrected so that gaps of closed contacts are 0, and sticking contacts do not move."""
     m = len(of_gap)
 
     def gaps(x: Array) -> Array:
@@ -204,7 +204,8 @@ def _course(
     pressing: Array,
     roundings: tuple,
 ):
-    """The `Course` from s to s1, where rates are y1, and what has gone wrong in it. pressing: of `presses`."""
+    """The `Course` from s to s1, with the rates y1 at the end, and what has gone wrong in it. pressing: of
+    `presses`."""
     gap, closed, held = system.contact.gap, modes.closed > 0, modes.held(system.contact.friction(params))
     g0, g1, y0 = gap(s.q, s.t, params), gap(s1.q, s1.t, params), rates(system, s.q, s.v, s.t, params)
     ends = (jnp.where(closed, 0, g0), jnp.where(closed, 0, g1)), (jnp.where(held, 0, y0), jnp.where(held, 0, y1))
@@ -215,7 +216,7 @@ def _course(
 
 
 def _roundings(s: State, J: Array, K: Array, f: Array, h: Array):
-    """What gaps, rates and forces may be beyond 0: roundings of what they are made of, contact forces among it."""
+    """How far gaps, rates and forces may be beyond 0: the roundings of their terms, including contact forces."""
     few, m = ROUNDING * float(jnp.finfo(f.dtype).eps), len(J) // 2
     along, pushed = product(jnp.abs(J), jnp.abs(s.v))[m:], h * product(jnp.abs(K), jnp.abs(f))
     of_gap = jnp.sum(jnp.abs(J[:m]), axis=1) * jnp.max(jnp.abs(s.q)) + h * pushed[:m]

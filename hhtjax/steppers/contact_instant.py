@@ -1,11 +1,11 @@
-"""What contacts do at an instant: who is closed behind it, with what velocities, accelerations and forces.
+"""Contacts at an instant: which of them are closed afterwards, and the velocities, accelerations and forces.
 
     impact:      v := v + M^-1 J^T (C + E)     by Poisson's law, compression and expansion (numerics/coulomb.py)
-    closing:     contacts whose flight would be shorter than a step stay down
-    modes:       of those that are down, by the complementarity problem of their accelerations
-    forces:      f, by these modes, and w = M^-1 (Q + J^T f)
+    closing:     contacts whose flight would be shorter than a step stay closed
+    modes:       of the closed ones, by the complementarity problem of their accelerations
+    forces:      f, for these modes, and w = M^-1 (Q + J^T f)
 
-Poisson's law makes no energy; Newton's, with friction, can. A contact that touches one which is closed lands without
+Poisson's law does not create energy; Newton's, with friction, can. A contact that depends on a closed one lands without
 restitution.
 
 References: F. Pfeiffer, C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996, Sec. 8; D. Stewart, J. Trinkle,
@@ -41,8 +41,8 @@ COUPLED = 1e-9  # of what a force does to its own contact, that it does to anoth
 
 
 class Place(NamedTuple):
-    """What contact forces do at a position: answer, force -> accelerations and multipliers; J; G = M^-1 J^T and the
-    multipliers that belong to it, by rows; K = J G."""
+    """The effect of contact forces at a position: answer, force -> accelerations and multipliers; J; G = M^-1 J^T and
+    its multipliers, by rows; K = J G."""
 
     answer: Any
     J: Array
@@ -60,7 +60,7 @@ def _place(method, system: FlatSystem, q: Array, t: Array, params: PyTree) -> Pl
 
 
 def begin_contact(method, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, h: Array) -> State:
-    """The state at a start: contacts that touch are closed, but for those that the accelerations take apart."""
+    """The state at a start: contacts that touch are closed, unless their accelerations separate them."""
     place, m = _place(method, system, q, t, params), system.contact.size
     w, _ = _free(system, place, q, v, t, params)
     fast, y = speeds(place.J, v, w, h), rates(system, q, v, t, params)
@@ -73,9 +73,9 @@ def begin_contact(method, system: FlatSystem, q: Array, v: Array, t: Array, para
 
 
 def past_switch(method, system: FlatSystem, params: PyTree, before: tuple, switch: Switch, at_once: Array, h: Array):
-    """The state behind a switch, and by how much later that is than the state before. at_once: whether it is at the
-    start of what is tried; what lands there without speed has let go only by an error of the step, and stays closed. h:
-    the whole step."""
+    """The state after a switch, and how much later it is than the state before. at_once: whether the switch is at the
+    start of the part being tried. A contact that lands there without speed has separated only by an error of the step,
+    and stays closed. h: the whole step."""
     s, _ = before
     contact, m = system.contact, system.contact.size
     late = _late(system, params, s, switch, h)
@@ -114,7 +114,7 @@ def past_switch(method, system: FlatSystem, params: PyTree, before: tuple, switc
 
 
 def jumped_contact(method, system: FlatSystem, s: State, params: PyTree, h: Array) -> State:
-    """The state where forces jump: contacts that are closed let go or break away at once, if they have to."""
+    """The state where forces jump: closed contacts separate or start to slide at once, if they must."""
     place, m = _place(method, system, s.q, s.t, params), system.contact.size
     along = rates(system, s.q, s.v, s.t, params)[m:]
     slides = jnp.where(jnp.abs(along) > _still(speeds(place.J, s.v, s.w, h)), s.contact.sig, 0)
@@ -122,8 +122,8 @@ def jumped_contact(method, system: FlatSystem, s: State, params: PyTree, h: Arra
 
 
 def _late(system: FlatSystem, params: PyTree, s: State, switch: Switch, h: Array) -> Array:
-    """By how much later than at a state the gap of what lands, or the velocity of what stops, is 0: a Newton step, the
-    state being near."""
+    """How much later than at a state the gap of a landing contact, or the velocity of a stopping one, is 0: one Newton
+    step, because the state is close."""
     m = len(switch.lands)
     y, ydot = rates(system, s.q, s.v, s.t, params), rates_of_rates(system, s.q, s.v, s.w, s.t, params)
     some = jnp.concatenate([switch.lands, switch.stops]) > 0
@@ -136,7 +136,7 @@ def _late(system: FlatSystem, params: PyTree, s: State, switch: Switch, h: Array
 
 
 def _held(place: Place, held: Array, v: Array, y: Array) -> Array:
-    """The velocities with which the rates y that are held, (2 m,), are 0."""
+    """The velocities for which the held rates y, (2 m,), are 0."""
     S = jnp.where(held[:, None], place.K, jnp.eye(len(y), dtype=y.dtype))
     return v + product(place.G.T, inverted(S)(jnp.where(held, -y, 0)))
 
@@ -144,8 +144,8 @@ def _held(place: Place, held: Array, v: Array, y: Array) -> Array:
 def _anew(
     system: FlatSystem, place: Place, s: State, down: Array, sig: Array, params: PyTree, stays: Array | None = None
 ):
-    """The state with the modes, forces and accelerations of contacts that are down. sig: the directions in which they
-    slide, 0 of those that do not. stays: (m,), which of them are closed whatever their force."""
+    """The state with the modes, forces and accelerations of closed contacts. sig: their sliding directions, 0 for those
+    that do not slide. stays: (m,), which of them are closed whatever their force."""
     q, v, t, mu = s.q, s.v, s.t, system.contact.friction(params)
     w, L = _free(system, place, q, v, t, params)
     ydot = rates_of_rates(system, q, v, w, t, params)

@@ -1,12 +1,13 @@
-"""Modes of contacts: who is closed, who sticks, who slides where to; and when in a step the first of them switches.
+"""Modes of contacts: which are closed, which stick, and in which direction others slide; and the first switch in a
+step.
 
-With modes the forces f = (f_N, f_T) answer to rates y = (dg/dt, s), or to their derivatives, linearly,
+With modes, the forces f = (f_N, f_T) depend linearly on rates y = (dg/dt, s), or on their derivatives,
 
     closed: (y + K f)_N = 0      sticking: (y + K f)_T = 0      sliding: f_T = -sig mu f_N      open: f = 0
 
-A closed contact lets go where f_N falls below 0, one that sticks breaks away where |f_T| grows beyond mu f_N, one that
-slides stops where s = 0, and an open one lands where its gap falls to 0. Between both ends of a step f and s are taken
-for lines, and gaps for cubics, which is what order 2 needs.
+A closed contact separates when f_N falls below 0. A sticking one starts to slide when |f_T| exceeds mu f_N. A sliding
+one stops when s = 0, and an open one lands when its gap falls to 0. Between both ends of a step f and s are taken as
+linear, and gaps as cubics, which is sufficient for order 2.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ class Modes(NamedTuple):
         return closed, closed & ~slides, slides
 
     def held(self, mu: Array) -> Array:
-        """(2 m,): which rates are 0."""
+        """(2 m,): which rates are held at 0."""
         closed, stuck, _ = self.which(mu)
         return jnp.concatenate([closed, stuck])
 
     def behind(self, switch: Switch) -> Modes:
-        """Those behind a switch, but for landings."""
+        """The modes after a switch, without landings."""
         sig = jnp.where(switch.breaks != 0, -switch.breaks, jnp.where(switch.stops > 0, 0, self.sig))
         return Modes(self.closed * (1 - switch.lets), sig)
 
@@ -58,7 +59,7 @@ def matrix(A: Array, modes: Modes, mu: Array) -> Array:
 
 
 def right_side(y: Array, f: Array, modes: Modes, mu: Array) -> Array:
-    """b with S x = b for the change x of the forces f, to which the rates y belong."""
+    """b with S x = b for the change x of the forces f, for the rates y."""
     m = len(mu)
     closed, stuck, slides = modes.which(mu)
     along = jnp.where(slides, -f[m:] - modes.sig * mu * f[:m], -f[m:])
@@ -66,16 +67,16 @@ def right_side(y: Array, f: Array, modes: Modes, mu: Array) -> Array:
 
 
 def presses(K: Array, modes: Modes, mu: Array) -> Array:
-    """(m,): what normal force does to the gap of each contact, with its friction, beyond rounding. Where that is not
-    positive the contact jams (Painleve)."""
+    """(m,): the effect of a normal force on the gap of each contact, including its friction, beyond rounding. If it is
+    not positive the contact jams (Painleve)."""
     m = len(mu)
     small = proximal(K.dtype)
     return jnp.stack([K[i, i] - modes.sig[i] * mu[i] * K[i, m + i] - small * jnp.abs(K[i, i]) for i in range(m)])
 
 
 class Switch(NamedTuple):
-    """Which contacts switch at an instant, (m,): 1 where one lets go, stops or lands; and the sign of the friction that
-    one which breaks away had. 0 elsewhere."""
+    """Which contacts switch at an instant, (m,): 1 if one separates, stops or lands; and for one that starts to slide
+    the sign of its friction. 0 elsewhere."""
 
     lets: Array
     breaks: Array
@@ -84,17 +85,17 @@ class Switch(NamedTuple):
 
     @classmethod
     def none(cls, like: Array) -> Switch:
-        """Of nobody."""
+        """No switch."""
         return cls(*[jnp.zeros_like(like)] * 4)
 
     def any(self) -> Array:
-        """Whether there is one."""
+        """Whether a contact switches."""
         return jnp.any((self.lets + jnp.abs(self.breaks) + self.stops + self.lands) > 0)
 
 
 class Course(NamedTuple):
-    """A step h in which nobody switched: the gaps, rates and forces at its start and at its end; and what of each is
-    rounding."""
+    """A step h in which no contact switched: the gaps, rates and forces at its start and at its end; and the rounding
+    of each."""
 
     h: Array
     gap: tuple[Array, Array]
@@ -104,8 +105,8 @@ class Course(NamedTuple):
 
 
 def asks(course: Course, modes: Modes, mu: Array):
-    """Who cannot stay as it is to the end of the step: lets go, breaks away, stops, lands (m,). Where the gap turns
-    around in between, the last may yet be wrong."""
+    """Which contacts cannot keep their mode to the end of the step: those that separate, slide, stop, land (m,). If a
+    gap turns around in between, a landing may be a false alarm."""
     m = len(mu)
     closed, stuck, slides = modes.which(mu)
     of_gap, of_rate, of_force = course.rounding
@@ -118,7 +119,7 @@ def asks(course: Course, modes: Modes, mu: Array):
 
 
 def first_switch(course: Course, modes: Modes, mu: Array):
-    """When the first contact switches, as a part of the step, 1 where none does; and the `Switch`."""
+    """The time of the first switch, as a fraction of the step, 1 if there is none; and the `Switch`."""
     m = len(mu)
     lets, breaks, stops, lands = asks(course, modes, mu)
     f0, f1 = course.f
@@ -138,14 +139,14 @@ def first_switch(course: Course, modes: Modes, mu: Array):
 
 
 def _on_line(a: Array, b: Array, some: Array) -> Array:
-    """Where what goes from a to b < 0 is 0; infinite for others."""
+    """The position at which a value that changes from a to b < 0 is 0; infinite for others."""
     some = some & (b < 0)
     a = jnp.maximum(a, 0)
     return jnp.where(some, a / jnp.where(some, a - b, 1), jnp.inf)
 
 
 def _on_cubic(course: Course, some: Array) -> Array:
-    """Where gaps fall to 0, on the cubics through both ends; infinite where they do not."""
+    """The positions at which gaps fall to 0, on the cubics through both ends; infinite if they do not."""
     m = len(some)
     (g0, g1), (d0, d1) = course.gap, (course.h * y[:m] for y in course.y)
     a, b = 3 * (g1 - g0) - 2 * d0 - d1, 2 * (g0 - g1) + d0 + d1

@@ -1,20 +1,20 @@
-"""Extrapolation of the linearly implicit mid-point rule: any order, one Jacobian a step, constraints and rotations too.
+"""Extrapolation of the linearly implicit mid-point rule: high order with one Jacobian a step, also with constraints.
 
-With accelerations and multipliers of the index-1 system, a mechanism is an ODE, y' = f(y, t) of y = (x, u): x is the
-displacement since the start of the step (of a rotation its rotation vector), u its rate. n micro-steps h = H/n of
+With accelerations and multipliers of the index-1 system, a mechanism is an ODE y' = f(y, t) with y = (x, u): x is the
+displacement since the start of the step (for a rotation its rotation vector), u its rate. n micro-steps h = H/n of
 
     (1 - h J) d_0 = h f(y_0),    (1 - h J)(d_i - d_{i-1})/2 = h f(y_i, t_i) - d_{i-1},    y_{i+1} = y_i + d_i
 
-end in S_n = y_n + (1 - h J)^-1 (h f(y_n, t_n) - d_{n-1}), which is smooth again. J is f_y at the start of the step. For
-any J the error of S_n is a series in h^2. So n = 2, 4, 6, ... and Aitken's and Neville's table take out one power after
-the other: order 2 k - 1 by k of them. With A = M, or [M, -B^T; B, 0], and K, C the derivatives of its equations in x
-and u, 1 - h J leaves the matrix A + h C + h^2 K for a change of u. A projection with M puts the ends of steps on
+end in S_n = y_n + (1 - h J)^-1 (h f(y_n, t_n) - d_{n-1}), a smoothing step. J is f_y at the start of the step. For any
+J the error of S_n is a series in h^2. With n = 2, 4, 6, ..., the table of Aitken and Neville removes one power after
+the other: k values of n give order 2 k - 1. With A = M, or [M, -B^T; B, 0], and K, C the derivatives of its equations
+in x and u, the matrix to solve for a change of u is A + h C + h^2 K. A projection with M moves the ends of steps onto
 Phi = 0 and dPhi/dt = 0.
 
-On y' = c y the method is A-stable for k = 3, the default, and A(89 degrees)-stable for k = 4, where an undamped
-vibration of frequency w grows by up to 6 % a step about w H = 8, if error control lets it; both take out at once what
-is stiffer. Of 49 tolerances from 1e-4 to 1e-10 on the squeezer, the error of the run is at most 1.2 times the tolerance
-for k = 3, where it is mostly far below, but up to 10 times for k = 4 and 5.
+On y' = c y the method is A-stable for k = 3, the default. For k = 4 it is A(89 degrees)-stable: an undamped vibration
+of frequency w grows by up to 6 % a step about w H = 8, if error control permits it. Both damp stiffer components at
+once. For 49 tolerances from 1e-4 to 1e-10 on the squeezer, the error of the run is at most 1.2 times the tolerance for
+k = 3, and mostly far below it, but up to 10 times for k = 4 and 5.
 
 G. Bader, P. Deuflhard, Numer. Math. 41, 1983, 373-398; E. Hairer, G. Wanner, Solving Ordinary Differential Equations
 II, Sec. IV.9 and VII.2.
@@ -55,7 +55,7 @@ MOST = 6  # levels; beyond, rounding grows and stability shrinks
 
 @dataclass(frozen=True, eq=False)
 class Extrapolated(Embedded, Stepper):
-    """The method of so many levels; made by `extrapolated`."""
+    """The method with a number of levels; made by `extrapolated`."""
 
     levels: int
 
@@ -71,7 +71,7 @@ class Extrapolated(Embedded, Stepper):
 
     @property
     def estimate_order(self) -> int:
-        """That of the error of the table without its first row."""
+        """The order of the error of the table without its first row."""
         return 2 * self.levels - 2
 
     def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
@@ -105,7 +105,8 @@ def placed(system: FlatSystem, s: State, x: Array, u: Array, a: Array):
 
 
 def weights(levels: int):
-    """(2, k): of the rows of the table in its last value, and in the one without the first row; for n = 2, 4, ..."""
+    """(2, k): the weights of the rows of the table in its last value, and in the last value without the first row; n =
+    2, 4, ..."""
     n = 2.0 * np.arange(1, levels + 1)
 
     def of(rows: range) -> list:
@@ -117,7 +118,7 @@ def weights(levels: int):
 
 
 def basic_step(system: FlatSystem, params: PyTree, H: Array, levels: int, s: State):
-    """(x, u) at the end of the step, and the same of one order less."""
+    """(x, u) at the end of the step, and the result of one order less."""
     dtype, N = s.v.dtype, system.size
     numbers = 2 * np.arange(1, levels + 1)
     inverses, A, K = matrices(system, params, s, H / jnp.asarray(numbers, dtype))
@@ -133,7 +134,7 @@ def basic_step(system: FlatSystem, params: PyTree, H: Array, levels: int, s: Sta
         return b + h * du, du
 
     def correction(h: Array, i: Array, inverse: Array, x: Array, u: Array, dx: Array, du: Array):
-        """Half of what the next increment is longer than the last, (dx, du)."""
+        """Half the difference between the next increment and the last one, (dx, du)."""
         q, v, _ = placed(system, s, x, u, s.w)
         w, _ = accelerations(system, q, v, s.t + i * h, params)
         return increment(h, inverse, h * u - dx, h * system.in_chart(x, u, w) - du)
@@ -185,8 +186,8 @@ def matrices(system: FlatSystem, params: PyTree, s: State, h: Array):
 def on_constraints(system: FlatSystem, params: PyTree, s: State, end: State):
     """The end of a step from s, moved onto the constraints, with its w and L; and the `Info`.
 
-    Two corrections of q by one matrix leave a rest of the third power of what was wrong. dPhi/dt is linear in v: one
-    correction leaves rounding, if its matrix is that of the new q, which w and L need anyway.
+    Two corrections of q with one matrix reduce an error to its third power. dPhi/dt is linear in v, so one correction
+    is exact to rounding if it uses the matrix at the new q, which w and L need anyway.
     """
     t, q, v = end.t, end.q, end.v
     if not system.num_constraints:
@@ -203,13 +204,13 @@ def on_constraints(system: FlatSystem, params: PyTree, s: State, end: State):
 
 
 def extrapolated(levels: int = 3) -> Extrapolated:
-    """Extrapolation of the linearly implicit mid-point rule: order 2 k - 1 by k levels.
+    """Extrapolation of the linearly implicit mid-point rule: k levels give order 2 k - 1.
 
-    Order 5 by default, stiff systems, constraints and rotations included: one Jacobian and k factorised matrices a
-    step, and k (k + 1) evaluations of the acceleration, each with a factorised M (and B). For error control and six or
-    more digits. A-stable for levels=3. More levels need fewer steps from eight digits on, but errors of a run were up
-    to ten times its tolerance; see the module's docstring. Steps under error control end at each of `times`. Events and
-    dry friction are refused.
+    Order 5 by default, also for stiff systems, constraints and rotations. A step needs one Jacobian, k factorised
+    matrices, and k (k + 1) evaluations of the acceleration, each with a factorised M (and B). Use it with error control
+    for six or more digits. A-stable for levels=3. More levels need fewer steps from eight digits on, but the error of a
+    run can reach ten times its tolerance; see the docstring of the module. With error control, steps end at each of
+    `times`. It does not support events and dry friction.
 
     Args:
         levels: k, from 2 to 6.
@@ -218,7 +219,7 @@ def extrapolated(levels: int = 3) -> Extrapolated:
         A `Stepper`.
 
     Raises:
-        TypeError, ValueError: levels is no such integer.
+        TypeError, ValueError: levels is not an integer from 2 to 6.
 
     References:
         Bader, Deuflhard, Numer. Math. 41, 1983, 373-398.

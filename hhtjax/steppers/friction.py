@@ -1,18 +1,19 @@
 """The generalised-alpha step with dry friction: set-valued, one factorisation, order 2 through every switch.
 
-While a joint slides one way its friction is a smooth force, and part of the residual, with the direction sig of the
-start of the step. Joints that stick, or switch inside the step, get a multiplier dtau, which the step answers linearly:
+While a joint slides in one direction its friction is a smooth force. It is part of the residual, with the direction sig
+of the start of the step. Joints that stick, or switch inside the step, get a multiplier dtau, on which the step depends
+linearly:
 
     w1 = wf - G dtau,    G = A^-1 H^T,    s1 = sf - W dtau,    W = H dv/dw G,
 
-by the one factorisation of A, f standing for the free step, with sig. A switch is resolved within the step, by the
-motion on either side of it (friction_switching.py). Behind it w, a, v and q go along G
-to where the new branch has them: the jump of the acceleration never enters the recursion, which therefore does not
-ring, and what sticks stays where it is.
+by the one factorisation of A; the suffix f denotes the free step, with sig. A switch is resolved within the step, by
+the motion on either side of it (friction_switching.py). Then w, a, v and q are moved along G to satisfy the new branch.
+The jump of the acceleration never enters the recursion, which therefore does not oscillate, and sticking joints do not
+move.
 
-A joint whose predicted velocity changes sign has no friction in that residual, which is expanded about a state before
-it does: all of its friction is dtau. Else a limit far above the load would turn the predictor, and with it the
-directions of all forces, through as much as it could in a whole step.
+If the predicted velocity of a joint changes sign, the residual contains no friction of this joint, and is expanded
+about a state before the change: all of its friction is dtau. Otherwise a limit far above the load would reverse the
+predicted velocity, and with it change the directions of all forces, by as much as it could in a whole step.
 """
 
 from __future__ import annotations
@@ -54,9 +55,9 @@ LAGS = 20  # how often multipliers, and limits that depend on them, are made ane
 def begin_friction(
     method, system, q: Array, v: Array, t: Array, params: PyTree, dt: Array, still: Any = False
 ) -> State:
-    """The state at the start: who slides, who sticks, and the accelerations of that.
+    """The state at the start: which joints slide, which stick, and the accelerations.
 
-    still: (m,), joints that are at rest, whatever rounding their velocities show.
+    still: (m,), joints that are at rest, although their velocities may show rounding.
     """
     if method.options.linearize in ("held", "state"):
         raise ValueError(
@@ -73,7 +74,7 @@ def begin_friction(
     settle = partial(_settle, system, at, H, rows, matvec(H, w) + own, size, still)
 
     def again(_, L: Array) -> Array:
-        """L with the friction of limits that depend on L."""
+        """L, for limits that depend on L, with the friction."""
         return L0 - matvec(pulls.T, settle(L)[1])
 
     L = lax.fori_loop(0, LAGS, again, jnp.zeros_like(L0)) if system.num_constraints else None
@@ -84,7 +85,8 @@ def begin_friction(
 
 
 def smooth_system(system, sig, tau, L):
-    """Without the law, but with the friction of joints that slide, and the forces tau at those that do not."""
+    """The system without the friction law, but with the friction of sliding joints, and the forces tau at the
+    others."""
 
     def force(q, v, t, params):
         f = system.friction.limit(q, v, L, t, params)
@@ -94,8 +96,8 @@ def smooth_system(system, sig, tau, L):
 
 
 def _settle(system, at: tuple, H: Array, rows, load: Array, size: Array, still: Real, L):
-    """sig and tau at the start, where without friction ds/dt is the load, of terms of that size. What rests is held,
-    within the limits; what cannot be held slides. still: who rests in any case."""
+    """sig and tau at the start, where without friction ds/dt is the load, with terms of the given size. Joints at rest
+    are held within the limits; those that cannot be held slide. still: which joints are at rest in any case."""
     q, v, t, params = at
     sig, f = jnp.where(still, 0, direction(system, at, H)), system.friction.limit(q, v, L, t, params)
     rests = sig == 0
@@ -105,8 +107,8 @@ def _settle(system, at: tuple, H: Array, rows, load: Array, size: Array, still: 
 
 
 def direction(system, at: tuple, H: Array):
-    """In which direction each joint slides: 0 where its velocity is a rounding of the velocities it is made of, which
-    would begin with the whole limit, and the accelerations of that."""
+    """The direction in which each joint slides: 0 if its velocity is a rounding of its terms. Otherwise a rounding
+    would start with the whole limit, and the accelerations from it."""
     q, v, t, params = at
     s, own = (system.friction.sliding(q, x, t, params) for x in (v, jnp.zeros_like(v)))
     noise = NOISE * float(jnp.finfo(s.dtype).eps) * (matvec(jnp.abs(H), jnp.abs(v)) + jnp.abs(own))
@@ -114,9 +116,9 @@ def direction(system, at: tuple, H: Array):
 
 
 def bind_friction(method, system, params: PyTree, dt, kept: Changing | None = None):
-    """The step: the free one, the switches within it, and what becomes of the state behind them.
+    """The step: the free step, the switches within it, and the state after them.
 
-    kept: a `Changing` that knows the matrix without the slopes of limits, which H^T, then constant, spreads.
+    kept: a `Changing` that has the matrix without the derivatives of the limits, which H^T (constant here) distributes.
     """
     law, size, dependent = system.friction, system.size, depends(system, method.redundant)
     driven = method.redundant is None and system.num_constraints >= system.positions
@@ -170,17 +172,18 @@ def bind_friction(method, system, params: PyTree, dt, kept: Changing | None = No
 
 
 def equations_of(method, system, params: PyTree, dt, s):
-    """As for constraints, also without."""
+    """The factorisation as for constraints, also without any."""
     if system.num_constraints:
         return equations(method, system, params, dt, s)
     return lambda s: residual(system, params, s), lambda w: method.arrive(system, s, dt, w), s.w, None, None
 
 
 def _foreseen(system, params: PyTree, h: Array, s, predicted, driven: bool):
-    """Which joints come to rest within the step, if nothing changes, and the state to linearise about: the predicted
-    one, but when the first of them rests all accelerations end: with them its whole friction would go on to act.
+    """Which joints come to rest within the step if nothing else changes, and the state at which to linearise. This is
+    the predicted state, except that accelerations end when the first joint rests: otherwise its whole friction would
+    continue to act.
 
-    driven: whether all motion is prescribed, which then goes on.
+    driven: whether all motion is prescribed; it then continues.
     """
     sliding, (sig, tau) = system.friction.sliding, s.friction
     s0, s1 = (sliding(x.q, x.v, x.t, params) for x in (s, predicted))
@@ -194,7 +197,7 @@ def _foreseen(system, params: PyTree, h: Array, s, predicted, driven: bool):
 
 
 def _with_slope(kept, system, sig: Array, at, params: PyTree) -> Updated:
-    """`kept`, with the slopes of limits where joints slide."""
+    """`kept`, with the derivatives of limits where joints slide."""
     limit = partial(system.friction.limit, params=params)
 
     def slope(x: State):
@@ -213,7 +216,7 @@ def free_step(
     factorize: Callable | Updated,
     at: State | None,
 ):
-    """The step in which every joint keeps its friction, and those that stuck have none; its factors are kept."""
+    """The step in which every joint keeps its friction, and sticking joints have none; its factors are kept."""
     if options.iterations is None:
         z, info = newton(system, r, path, z, s, factorize, options.tolerance, options.max_iterations)
         z, _, inverse, along = solve_and_keep(r, path, z, factorize)
@@ -236,8 +239,8 @@ def _switches(
     h: Array,
     given: Real,
 ):
-    """How joints come out of the step, and what part of it is left where there were too many events; of rows that may
-    depend on each other also what would hold joints that stick."""
+    """The state of joints at the end of the step, and the fraction of it that is left if there were too many events;
+    for rows that may depend on each other also the forces that would hold sticking joints."""
     if given is not False:
         return run_pieces(sf, s, sig, tau, f, W, rows, h, given)
     Wh = h * rows.K
@@ -249,7 +252,7 @@ def _switches(
 def _behind(system, params: PyTree, s, s1, x: Array, end, f, G, rows, still) -> State:
     """The state s1 at the end of the step, displaced by x, moved onto the branches on which its joints end.
 
-    still: of rows that may depend on each other, the displacement if nobody switched.
+    still: for rows that may depend on each other, the displacement if no joint switched.
     """
     dependent = still is not None
     h, sig, K = s1.t - s.t, s.friction.sig, rows.K
@@ -285,7 +288,7 @@ def _behind(system, params: PyTree, s, s1, x: Array, end, f, G, rows, still) -> 
 
 
 def _defect(method, system, params: PyTree, rubbing, s1, dtau: Array, inverse):
-    """`Info.defect` at the end s1 of the step, with its changes dtau of friction; None of the converged method."""
+    """`Info.defect` at the end s1 of the step, with the changes dtau of friction; None for the converged method."""
     if method.options.iterations is None:
         return None
     left = rubbing(s1)
@@ -294,7 +297,7 @@ def _defect(method, system, params: PyTree, rubbing, s1, dtau: Array, inverse):
 
 
 def _switched(system: FlatSystem, s: State, s1: State, end: Switch, G, dependent: bool) -> Array:
-    """`Info.switched`: by how much friction that switched from s to s1 has changed the accelerations."""
+    """`Info.switched`: the change of the accelerations by friction that switched between s and s1."""
     same = end.kept | ((s.friction.sig == 0) & (end.sig == 0))
     if dependent:  # where one switches, others may hold what it held
         same = end.kept | jnp.all(same)
@@ -303,21 +306,21 @@ def _switched(system: FlatSystem, s: State, s1: State, end: Switch, G, dependent
 
 
 def _taken_off(x: Array, y: Array, G: Array) -> Array:
-    """x - G^T y, and 0 where that is rounding."""
+    """x - G^T y; 0 where that is rounding."""
     left = x - matvec(G.T, y)
     noise = NOISE * float(jnp.finfo(x.dtype).eps) * matvec(jnp.abs(G.T), jnp.abs(y))
     return jnp.where(jnp.abs(left) < noise, 0, left)
 
 
 def each_row(f: Callable, rows):
-    """f of each row; without vmap of a single one, which leaves less to compile."""
+    """f of each row; a single row is done without vmap, which compiles less."""
     if len(rows) == 1:
         return jax.tree.map(lambda x: x[None], f(rows[0]))
     return jax.vmap(f)(rows)
 
 
 def _is_limit(law, s: State, params: PyTree) -> Array:
-    """Whether the limits at a state are finite and >= 0; of a state that is not finite others tell."""
+    """Whether the limits at a state are finite and >= 0. A state that is not finite is reported elsewhere."""
     f = law.limit(s.q, s.v, s.L, s.t, params)
     return jnp.all((f >= 0) & (f < jnp.inf)) | ~(jnp.all(jnp.isfinite(s.q)) & jnp.all(jnp.isfinite(s.v)))
 
@@ -349,7 +352,7 @@ def smoothed_friction(
     alone: bool = False,
     lags: bool = False,
 ) -> State:
-    """As `smoothed`."""
+    """As `smoothed`, with dry friction."""
     free = system._replace(friction=None)
     return smoothed(method, free, s, params, h, moves, resolves, alone, partial(finished, system.friction), lags)
 
@@ -366,7 +369,7 @@ def finished(
     rows = rows_of(system, q, t, params, H, G, pulls, False, depends(system, method.redundant))
 
     def taken_off(x: Array, some: Array, own: Real = 0.0) -> Array:
-        """x without what moves these joints."""
+        """x without the part that moves these joints."""
         return x - matvec(G.T, rows.solve(rows.K, some, matvec(H, x) + own))
 
     stays = False

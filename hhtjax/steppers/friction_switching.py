@@ -1,14 +1,16 @@
-"""What the dry friction of several joints does within a step: from event to event, as what one does jerks the others.
+"""The switches of several joints with dry friction within a step: from event to event, as each switch accelerates
+others.
 
-Between events the sliding velocities go linearly: p, by which the friction differs from that of the step in which
-nobody switches, is known where a joint slides, and at rest it is what keeps the velocity there at 0,
+Between events the sliding velocities are linear in time. p is the difference of the friction from that of the step in
+which no joint switches. It is known for sliding joints; for joints at rest it keeps the velocity at 0,
 
     ds/dtheta = c - Wh p,    p = (sig f - base) where sliding,    (c - Wh p) = 0 where at rest,    theta = (t - t0)/h.
 
-An event: a joint that slides comes to rest, or the load of one at rest grows to its limit and it breaks away. Who does
-it first switches; of several at once, the first of them, until none is left (Murty 1974: finite, as K is positive).
-How many that takes no small number bounds, so values come from a loop that ends with the step. Derivatives need a fixed
-number, of what moves them only: the pieces between instants, however many switch at one.
+Events: a sliding joint comes to rest, or the load of a joint at rest exceeds its limit and it starts to slide. The
+first joint to do so switches; of several at the same time, the first of them, until none is left (Murty 1974: finite,
+as K is positive). No small number bounds how many switches this takes, so values come from a loop that ends with the
+step. Derivatives need a fixed number, but only of the pieces between instants, however many joints switch at one
+instant.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ PIECES = 4, 2  # and per joint, of a step that is differentiated; of 100 000 vio
 
 
 class Moment(NamedTuple):
-    """Within a step: time since its start over h, sliding velocities, directions, distances over h, who kept on."""
+    """Within a step: time since its start over h, sliding velocities, directions, distances over h, which joints kept
+    their state."""
 
     theta: Array
     s: Any
@@ -40,7 +43,7 @@ class Moment(NamedTuple):
 
 
 class Steady(NamedTuple):
-    """A step in which nobody switches: its ds/dtheta, and its friction, base = start + theta rise; limits; and Wh."""
+    """A step without switches: its ds/dtheta, and its friction, base = start + theta rise; limits; and Wh."""
 
     c: Array
     start: Any
@@ -50,8 +53,9 @@ class Steady(NamedTuple):
 
 
 def run_events(sf: Array, s: Array, sig: Array, tau: Array, f: Array, W: Array, Wh: Array):
-    """How joints come out of a step that start with s and, unless they stick, would come out with sf; and what part of
-    the step is left where the events were too many. W: fall of sf by units of friction; Wh: that of s in a time h."""
+    """The state of joints at the end of a step that start with s and, unless they stick, would end with sf; and the
+    fraction of the step that is left if there were too many events. W: decrease of sf per unit of friction; Wh:
+    decrease of s in a time h."""
     smooth = f == 0  # where nothing rubs, nothing switches
     stuck = (sig == 0) & ~smooth
     held = solve_some(W, stuck, sf)
@@ -67,7 +71,7 @@ def run_events(sf: Array, s: Array, sig: Array, tau: Array, f: Array, W: Array, 
 
 @jax.custom_jvp
 def _to_the_end(at: Moment, steady: Steady) -> Moment:
-    """The end of the step, by as many events as there are."""
+    """The end of the step, with as many events as occur."""
 
     def unfinished(carry: tuple) -> Array:
         at, i = carry
@@ -82,7 +86,7 @@ def _(primals: tuple, tangents: tuple):
 
 
 def _by_pieces(at: Moment, steady: Steady) -> Moment:
-    """The same in a fixed number of pieces, for reverse mode."""
+    """As above in a fixed number of pieces, for reverse mode."""
 
     def piece(at: Moment, steady: Steady) -> Moment:
         return _event(_settled(at, steady), steady)
@@ -94,13 +98,13 @@ def _by_pieces(at: Moment, steady: Steady) -> Moment:
 
 
 def _settled(at: Moment, steady: Steady) -> Moment:
-    """Past the events of this very instant; who switches has s = 0, whatever is differentiated."""
+    """Handles the events at the present instant; joints that switch have s = 0, also in derivatives."""
     sig, keeps = _switching(*lax.stop_gradient((at, steady)))
     return at._replace(s=jnp.where(keeps, at.s, 0), sig=sig, kept=at.kept & keeps)
 
 
 def _switching(at: Moment, steady: Steady):
-    """Directions behind the events of this very instant, and who keeps on."""
+    """Directions after the events at the present instant, and which joints keep their state."""
 
     def unfinished(carry: tuple) -> Array:
         _, more, i = carry
@@ -119,7 +123,7 @@ def _switching(at: Moment, steady: Steady):
 
 
 def _event(at: Moment, steady: Steady) -> Moment:
-    """On to the next event, and past it; or to the end of the step."""
+    """Advances to the next event, and handles it; or to the end of the step."""
     return _on(at, *_next(at, steady))
 
 
@@ -135,7 +139,7 @@ def _on(at: Moment, wait: Array, to: Array, speed: Array) -> Moment:
 
 
 def _next(at: Moment, steady: Steady):
-    """How long until each joint switches, to what, and ds/dtheta till then."""
+    """The time until each joint switches, its new direction, and ds/dtheta until then."""
     f, smooth = steady.f, steady.f == 0
     rests = (at.sig == 0) & ~smooth
     rate, load = _motion(at.sig, rests, steady)
@@ -185,8 +189,8 @@ SETTLED = 1e-9  # change of friction over its limit that passes; 1000 roundings 
 
 
 class Switch(NamedTuple):
-    """How joints come out of a step: sliding velocity s, direction, change of friction tau, the distance slid over h,
-    and whether they kept their friction."""
+    """The state of joints at the end of a step: sliding velocity s, direction, change of friction tau, the distance
+    slid over h, and whether they kept their friction."""
 
     s: Any
     sig: Array
@@ -196,7 +200,7 @@ class Switch(NamedTuple):
 
 
 def switch(b: Array, s: Array, sig: Array, tau: Array, f: Array, W: Array, Wh: Array) -> Switch:
-    """Each joint by itself, elementwise. W: fall of b by a unit of friction; Wh: that of s in a time h."""
+    """Each joint separately, elementwise. W: decrease of b per unit of friction; Wh: decrease of s in a time h."""
     slides, smooth = sig != 0, f == 0  # where nothing rubs, nothing switches
     keeps = slides & (sig * b >= 0) | smooth
     D = b - s + 2 * sig * f * Wh
@@ -222,7 +226,7 @@ def switch(b: Array, s: Array, sig: Array, tau: Array, f: Array, W: Array, Wh: A
 
 
 def is_settled(left: Array) -> Array:
-    """Whether so much may be left."""
+    """Whether this fraction of a step may be left."""
     return left <= max(SETTLED, 1e3 * float(jnp.finfo(left.dtype).eps))
 
 
@@ -243,8 +247,8 @@ BEYOND = 2.0  # theta of a step that is done
 
 
 class Course(NamedTuple):
-    """A step in which nobody switches: its ds/dtheta, and its friction, base = start + theta rise; limits; the rows,
-    what a unit of force does to velocities in the step, what is rounding of that, and how large the terms of c are."""
+    """A step without switches: its ds/dtheta, and its friction, base = start + theta rise; limits; the rows; the effect
+    of a unit of force on velocities in the step, and what counts as rounding of it; and the size of the terms of c."""
 
     c: Array
     start: Any
@@ -257,10 +261,10 @@ class Course(NamedTuple):
 
 
 def run_pieces(sf: Array, s: Array, sig: Array, tau: Array, f: Array, W: Array, rows, h: Array, driven: Array):
-    """How joints come out of a step that start with s and, unless they stick, would come out with sf; what part of the
-    step is left where the events were too many; and what would hold joints that stick if nobody switched. Distances are
-    those beyond the ones of that step. W: fall of sf by units of friction; driven: where a part of s
-    is prescribed."""
+    """The state of joints at the end of a step that start with s and, unless they stick, would end with sf; the
+    fraction of the step that is left if there were too many events; and the forces that would hold sticking joints if
+    no joint switched. Distances are relative to those of that step. W: decrease of sf per unit of friction; driven:
+    where a part of s is prescribed."""
     smooth = f == 0  # where nothing rubs, nothing switches
     stuck, basis = (sig == 0) & ~smooth, rows.basis
     held = rows.solve(W, stuck, sf)
@@ -288,7 +292,7 @@ def run_pieces(sf: Array, s: Array, sig: Array, tau: Array, f: Array, W: Array, 
 
 @jax.custom_jvp
 def _dependent_to_the_end(at: Moment, course: Course) -> Moment:
-    """The end of the step, by as many events as there are."""
+    """The end of the step, with as many events as occur."""
 
     def unfinished(carry: tuple) -> Array:
         at, i = carry
@@ -303,7 +307,7 @@ def _(primals, tangents):
 
 
 def _dependent_by_pieces(at, course):
-    """The same in a fixed number of pieces, for reverse mode."""
+    """As above in a fixed number of pieces, for reverse mode."""
 
     def visit(at, _):  # a `lax.cond` cannot be transposed in a batch, as this is the rule of a derivative
         return call_where(_piece, at.theta < BEYOND, at, course), None
@@ -312,7 +316,7 @@ def _dependent_by_pieces(at, course):
 
 
 def _piece(at: Moment, course: Course) -> Moment:
-    """On to the next joints that come to rest or break away, or to the end of the step."""
+    """Advances to the next joints that come to rest or start to slide, or to the end of the step."""
     f, smooth, rest = course.f, course.f == 0, 1 - at.theta
     middle = (1 + at.theta) / 2
     sig, until, breaks = _directions(at, course, middle)
@@ -333,20 +337,21 @@ def _piece(at: Moment, course: Course) -> Moment:
 
 
 def _change(sig: Array, rests: Array, course: Course, theta: Real) -> Array:
-    """phi - base where that is known, 0 for friction at rest."""
+    """phi - base where it is known, 0 for friction at rest."""
     return jnp.where(rests, 0, sig * course.f) - (course.start + theta * course.rise)
 
 
 def _load(sig: Array, rests: Array, course: Course, theta: Real) -> Array:
-    """ds/dtheta where nothing holds joints at rest."""
+    """ds/dtheta if nothing holds joints at rest."""
     return course.c - matvec(course.Wh, _change(sig, rests, course, theta))
 
 
 def _directions(at: Moment, course: Course, middle: Array):
-    """Who slides, and where to; how long joints at rest are held; and who slides then, and where to.
+    """Which joints slide, and in which direction; how long joints at rest are held; and which of them slide then, and
+    in which direction.
 
-    What the loads of the whole rest of the step leave at rest is held until they have grown beyond the limits. What
-    they are beyond already slides at once, if their means are."""
+    Joints that the loads of the whole rest of the step leave at rest are held until the loads exceed the limits. Joints
+    whose loads exceed the limits already slide at once, if their mean loads do too."""
     sig, rests = at.sig, (at.sig == 0) & (course.f != 0)
     known, there = lax.stop_gradient((course, at.theta))
     load = _load(sig, rests, known, lax.stop_gradient(middle))
@@ -361,7 +366,7 @@ def _directions(at: Moment, course: Course, middle: Array):
 
 
 def _speed(sig: Array, rests: Array, course: Course, theta: Array) -> Array:
-    """ds/dtheta with these directions, what rests being held."""
+    """ds/dtheta with these directions, with joints at rest held."""
     change = _change(sig, rests, course, theta)
     change = change + course.rows.solve(course.Wh, rests, course.c - matvec(course.Wh, change))
     return jnp.where(rests, 0, course.c - matvec(course.Wh, change))

@@ -1,6 +1,6 @@
 """The generalised-alpha family, with and without iterations: the step, the method, and its constructors.
 
-The formulas are in residual.py; constraints are in constrained.py, and add rows to the residual.
+The formulas are in residual.py. Constraints, which add rows to the residual, are in constrained.py.
 """
 
 from __future__ import annotations
@@ -253,49 +253,50 @@ def hht(alpha: Real = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
 
     Args:
         alpha: in [-1/3, 0]; a number, or a tracer to differentiate.
-        iterations: 1, non-iterative; k, that many Newton iterations; None, Newton until `tolerance`.
-        linearize: the point about which the first solve expands M w - Q at t1.
-            "predictor": q, v for constant acceleration. Smooth in all arguments, so the one for fitting,
-                and for steps that resolve the motion. Fails first at large steps: on stiffening springs,
-                nonlinear dampers, chaotic links.
-            "held": q + h v, with the velocity v held as it is at t. Smooth, the most bounded, 1.5 to 1.7 times the
-                error on average.
-            "state": (q, v, w) at t, the acceleration then refreshed by M w1 = Q1 (Kim's step made second
-                order). Best with nonlinear dampers; loses two digits on a stiff slow manifold, fails at
-                contacts, and costs a second factorisation, of M.
-            "auto": predictor, or held where its residual is the smaller one and matters: there a second solve.
-                The map jumps by O(h^3) where the choice changes.
-            The default is "auto" for one iteration and "predictor" for more: over 14 scenes, 10 steps and 3
-            alphas, auto stayed bounded in 91 % of the runs, predictor in 85, held in 95, the converged
-            method in 94; auto and predictor are equally accurate (`python -m experiments linearization`).
-        tolerance: on each row of the residual M w - Q, in units of force, and never more than a millionth of the
-            row's own terms, or tolerance times these if that is less; a residual that is rounding ends the iteration
-            too (iterations=None only).
+        iterations: 1: non-iterative; k: that many Newton iterations; None: Newton until `tolerance`.
+        linearize: the point about which the first solve linearises M w - Q at t1.
+            "predictor": q, v for constant acceleration. Smooth in all arguments. Use it for fitting, and for steps that
+                resolve the motion. The first to fail at large steps: on stiffening springs, nonlinear dampers, chaotic
+                links.
+            "held": q + h v, with v as it is at t. Smooth, and bounded most often, but 1.5 to 1.7 times the error on
+                average.
+            "state": (q, v, w) at t; the acceleration is then recomputed from M w1 = Q1 (Kim's step made second order).
+                Best with nonlinear dampers. It loses two digits on a stiff slow manifold, fails at contacts, and needs
+                a second factorisation, that of M.
+            "auto": "predictor", or "held" where the predictor's residual is not negligible and the residual of "held"
+                is smaller; such a step has a second solve. The result jumps by O(h^3) where the choice changes.
+            Default: "auto" for one iteration, "predictor" for more. Over 14 scenes, 10 steps and 3 alphas, auto stayed
+            bounded in 91 % of the runs, predictor in 85, held in 95, the converged method in 94. auto and predictor are
+            equally accurate (`python -m experiments linearization`).
+        tolerance: for the converged method (iterations=None only). Each row of the residual M w - Q must be below
+            `tolerance`, in units of force, and below min(tolerance, 1e-6) times the size of the terms in that row. The
+            iteration also ends when the residual is only rounding.
         max_iterations: Newton iterations before a step counts as failed (iterations=None only).
-        start: how the recursion begins, at t0, behind events, and where held inputs jump.
-            "smooth": with an implicit step of the velocity, of what damps more stiffly than h resolves alone, and an
-                acceleration by corrections with the matrix of the step. What h resolves is changed by O(h^5). Without
-                it a light, strongly damped coordinate that does not start with the velocity of its forces is thrown by
-                h^2 M^-1 Q (1/2 - beta/gamma), any multiple of where it goes. `run.v[0]` is the v0 that was given.
-            "corrected": the same, and a0 = w0 + (alpha_m - alpha_f) h dw/dt, the second-order value. q, v and w are of
-                order 2 without; a and multipliers need it.
-            "simple": a0 = w0 = M^-1 Q, the recursion to the letter.
-            Default: smooth; corrected with constraints. Internal states keep their rates.
-        formulation: of constraints. "ggl": Phi = 0 and dPhi/dt = 0, by one more multiplier for each (Gear,
-            Gupta, Leimkuhler 1985); "index3": Phi = 0 alone, of index 3 as an equation: its
-            multipliers, and their derivatives, hold roundings over h^2. With constraints, as with dry friction, the
-            one linearisation is at the predictor.
-        redundant: "least_squares" for constraints that depend on each other, always or in singular positions: of
-            their multipliers the smallest. One singular value decomposition per solve. By default they are
-            an error at the start, and a failure named by `solution.check()` at the step where they become so. Also for
-            directions of dry friction that may depend on each other where that shows neither in their number nor at
-            the start.
+        start: how the recursion starts: at t0, after events, and where held inputs jump.
+            "smooth": components of the velocity whose damping is too stiff for h first take an implicit step, and the
+                acceleration is corrected with the matrix of the step. Motion that h resolves changes by O(h^5) only.
+                Without this, a light, strongly damped coordinate that does not start with the velocity its forces
+                demand is thrown by h^2 M^-1 Q (1/2 - beta/gamma), which can be any multiple of its correct
+                displacement. `run.v[0]` is still the given v0.
+            "corrected": as "smooth", and a0 = w0 + (alpha_m - alpha_f) h dw/dt, the second-order value. q, v and w have
+                order 2 without it; a and multipliers need it.
+            "simple": a0 = w0 = M^-1 Q, the unmodified recursion.
+            Default: "smooth"; with constraints "corrected". Internal states keep their rates.
+        formulation: of constraints. "ggl": enforces Phi = 0 and dPhi/dt = 0, with a second multiplier for each
+            constraint (Gear, Gupta, Leimkuhler 1985). "index3": enforces Phi = 0 only, an equation of index 3; rounding
+            errors of the multipliers, and of their derivatives, are amplified by 1/h^2. With constraints, as with dry
+            friction, the residual is linearised once, at the predictor.
+        redundant: "least_squares" for constraints that depend on each other, always or in singular positions. It
+            returns the smallest multipliers, by one singular value decomposition per solve. By default dependent
+            constraints are an error at the start, and later a failure that `solution.check()` reports for the step in
+            which they become dependent. Needed also for directions of dry friction that may become dependent, if
+            neither their number nor the start shows it.
         kinematics: of rotations. "chart": the recursion runs on the rotation vector of each step (Cardona, Geradin
-            1989, made second order); "lie": on the angular velocity itself (Bruls, Cardona 2010). Simpler, of
-            order 2 too, but 4 to 5 times the error on a fast top.
-        solve: `solve(A, b)` for A (n, n) and b (n,), in place of the library's LU. Need not be differentiable. For
-            large systems `banded(p)` or `conjugate_gradients(iterations)`. A residual above 1e-6 of b (1e-3 in
-            float32; or the `tolerance` of these two) is a failure that `solution.check()` names.
+            1989, made second order). "lie": it runs on the angular velocity (Bruls, Cardona 2010). This is simpler and
+            of order 2 too, but has 4 to 5 times the error on a fast top.
+        solve: `solve(A, b)` for A (n, n) and b (n,), instead of the library's LU. It need not be differentiable. For
+            large systems use `banded(p)` or `conjugate_gradients(iterations)`. A relative residual above 1e-6 (1e-3 in
+            float32; or the `tolerance` of these two) is a failure that `solution.check()` reports.
 
     Returns:
         A `Stepper`.
@@ -345,7 +346,7 @@ def newmark(beta: Real = 0.25, gamma: Real = 0.5, **options: Unpack[Keywords]) -
 
 @takes_options
 def bossak(alpha: Real = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
-    """Bossak (Wood, Bossak, Zienkiewicz): HHT's weighting put on the inertia instead of the forces.
+    """The method of Bossak (Wood, Bossak, Zienkiewicz): as HHT, but the inertia is averaged instead of the forces.
 
         alpha_m = alpha,  alpha_f = 0,  beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
 
@@ -371,7 +372,7 @@ def bossak(alpha: Real = -0.1, **options: Unpack[Keywords]) -> GeneralizedAlpha:
 
 @takes_options
 def generalized_alpha(rho_inf: Real = 0.8, **options: Unpack[Keywords]) -> GeneralizedAlpha:
-    """Chung and Hulbert's generalised-alpha: least low-frequency damping for a given one at infinity.
+    """Chung and Hulbert's generalised-alpha: the least low-frequency damping for a given damping at infinite frequency.
 
         alpha_m = (2 rho - 1)/(rho + 1),  alpha_f = rho/(rho + 1),
         beta = (1 - alpha_m + alpha_f)^2/4,  gamma = 1/2 - alpha_m + alpha_f
@@ -416,8 +417,8 @@ def implicit_euler(
 ) -> ImplicitEuler:
     """Implicit Euler, v1 = v + h w1, q1 = q + h v1, M(q1) w1 = Q(q1, v1, t1), solved by Newton.
 
-    Order 1, L-stable, strongly damping: the reference for robustness, not for accuracy. Constraints (GGL), rotations
-    (in charts), internal states and dry friction are solved as by `hht`.
+    Order 1, L-stable, strongly damping: a reference for robustness, not for accuracy. It supports constraints (GGL),
+    rotations (in charts), internal states and dry friction, as `hht` does.
 
     Args:
         iterations: None, Newton until `tolerance`; k, that many Newton iterations.

@@ -41,8 +41,8 @@ def linearized_solve(
 ):
     """w1 with r(path(w1)) = 0, r replaced by its tangent at the state `at` (default: path(w)), and its `Info`.
 
-    One linearisation, one factorisation, one solve: this is the non-iterative step, and Newton's. again: one solve
-    more, of the residual at the end, which becomes `Info.defect`.
+    One linearisation, one factorisation, one solve: this is the non-iterative step, and a Newton step. again: one more
+    solve, of the residual at the end, which becomes `Info.defect`.
     """
     w, info, *_ = solve_and_keep(r, path, w, factorize, at, again)
     return w, info
@@ -56,36 +56,37 @@ def solve_and_keep(
     at: State | None = None,
     again: bool = False,
 ):
-    """The same, the solve b -> x for more right-hand sides, and the linear function from x to the change of state."""
+    """As `linearized_solve`; also returns the solve b -> x for more right-hand sides, and the linear function from x to
+    the change of state."""
     expansion = Expand(partial(linearize_rows, r), partial(jax.linearize, path), w)(at)
     return *solve_expanded(r, path, w, factorize, again, expansion), expansion.along
 
 
 def linearized(f: Callable, x: PyTree, linearize: Callable = jax.linearize):
-    """f(x) and its tangent there; a word where a callback has no derivative."""
+    """f(x) and its tangent there; explains the error if a callback has no derivative."""
     with callbacks_named():
         return linearize(f, x)
 
 
 @contextmanager
 def callbacks_named():
-    """Says which derivatives are needed, where a callback has none."""
+    """Explains which derivatives are needed, if a callback has none."""
     try:
         yield
     except ValueError as error:
         if "callbacks do not support JVP" not in str(error):
             raise
         raise ValueError(
-            "this stepper needs the derivatives of the force (and mass and constraint) in q and v, and in t where it "
-            "is `rosenbrock` or meets events; `jax.pure_callback` and `io_callback`, which are called there, have "
-            "none. Give them some by `jax.custom_jvp`, or take a stepper that needs none, such as `rk4()`."
+            "this stepper needs the derivatives of the force (and mass and constraint) in q and v, and in t for "
+            "`rosenbrock` or events. `jax.pure_callback` and `io_callback`, which are called there, have "
+            "none. Define them by `jax.custom_jvp`, or take a stepper that needs none, such as `rk4()`."
         ) from error
 
 
 def linearize_rows(r: Callable, s: State, linearize: Callable = jax.linearize):
-    """r and its tangent about a state s, for changes that leave the time as it is.
+    """r and its tangent about a state s, for changes that do not change the time.
 
-    Where r cannot be differentiated, as with a `jax.pure_callback` of the time, the time is held.
+    If r cannot be differentiated in the time, as with a `jax.pure_callback` of it, the time is held constant.
     """
     try:
         return linearize(r, s)
@@ -94,7 +95,8 @@ def linearize_rows(r: Callable, s: State, linearize: Callable = jax.linearize):
 
 
 class Expansion(NamedTuple):
-    """Of r about a state. value: of r at path(w), by its tangent there; here: r there; along: the tangent of path."""
+    """The expansion of r about a state. value: of r at path(w), by its tangent; here: r at the state; along: the
+    tangent of path."""
 
     value: Array
     at: Any
@@ -104,14 +106,14 @@ class Expansion(NamedTuple):
 
 
 class Expand:
-    """State -> the `Expansion` about it, or about path(w) for None. r, path: what `jax.linearize` makes of them."""
+    """State -> the `Expansion` about it, or about path(w) for None. r, path: results of `jax.linearize`."""
 
     def __init__(self, r, path, w: Array):
         self.r, self.path, self.w = r, path, w
         self.predicted, self.other = staged(self._predicted, w.size), staged(self._other, w.size)
 
     def __call__(self, at: State | None = None, known: tuple | None = None) -> Expansion:
-        """The `Expansion`; known: path(w) and the tangent of path, where they are."""
+        """The `Expansion`; known: path(w) and the tangent of path, if they are available."""
         if at is None:
             return Expansion(*self.predicted(self.w))
         start, along = staged(self.path, self.w.size)(self.w) if known is None else known
@@ -145,12 +147,12 @@ def solve_expanded(
 
 
 def left_by(factorize: Callable | Constant | Known, f: Callable, b: Array, x: Array):
-    """What x leaves of b = f(x), relative to it; None for the library's own solve, which needs no proof."""
+    """The relative residual of b = f(x); None for the library's own solve, which need not be checked."""
     return factorize.leaves(f, b, x) if isinstance(factorize, Trusted) else None
 
 
 def told(factorize, left, info=Info()) -> Info:  # noqa: B008 (a tuple)
-    """The `Info` of a step with a solve that left so much."""
+    """The `Info` of a step whose solve left this residual."""
     return info if left is None else info._replace(solve_residual=left, solved=factorize.accepts(left))
 
 
@@ -164,13 +166,14 @@ def newton(
     tolerance: Real,
     max_iterations: int,
 ):
-    """Newton on r(path(w)) from w, s being the state before, until each row of r is small beside its own terms:
+    """Newton on r(path(w)) from w, where s is the state before, until each row of r is small compared with its own
+    terms:
 
-        |r_i| <= tolerance and |r_i| <= relative (|A| |w|)_i,    or each is no larger than rounding makes it,
+        |r_i| <= tolerance and |r_i| <= relative (|A| |w|)_i,    or each is no larger than its rounding,
 
-    relative being RELATIVE, or the tolerance if that is less: so units in which all terms are small do not loosen it.
-
-    So no row is measured by the forces of another. The second is asked where an iteration no longer halves a row.
+    relative being RELATIVE, or the tolerance if that is smaller. So units in which all terms are small do not loosen
+    the test, and no row is compared with the forces of another. Rounding is tested when an iteration no longer halves a
+    row.
 
     Differentiated by the implicit-function theorem, forward and reverse.
     """
@@ -215,9 +218,9 @@ def newton(
 
 
 def is_rounding(system: FlatSystem, r: Callable, s0: State, s1: State, value: Array, limit: Array, ask: Array) -> Array:
-    """If asked, whether each row of r is below its limit, or changes by as much where s1 is rounded otherwise.
+    """If asked, whether each row of r is below its limit, or changes by as much when s1 is rounded differently.
 
-    A loop, and no condition: of those that vmap makes it takes the steps that some member needs.
+    It is a loop and not a condition, because a loop under vmap takes only the steps that some member needs.
     """
     sizes = term_sizes(system, s0, s1)
 
@@ -235,7 +238,8 @@ def is_rounding(system: FlatSystem, r: Callable, s0: State, s1: State, value: Ar
 
 
 def term_sizes(system: FlatSystem, s0: State, s1: State):
-    """Sizes of what the numbers of the state s1, reached from s0, are sums of, and their roundings relative to."""
+    """The sizes of the terms of which the numbers of the state s1, reached from s0, are sums; roundings are relative to
+    these."""
     h = s1.t - s0.t
     w = jnp.abs(s0.w) + jnp.abs(s1.w)
     v = jnp.abs(s0.v) + jnp.abs(s1.v) + h * w
@@ -244,7 +248,7 @@ def term_sizes(system: FlatSystem, s0: State, s1: State):
 
 
 def _shake(size: Array, i: Array) -> Array:
-    """A few roundings, of both signs and uneven, so that equal terms do not cancel; others for each i."""
+    """A few roundings, of both signs and unequal, so that equal terms do not cancel; different for each i."""
     k, golden = np.arange(size.size), 0.618034
     first = (0.75 + golden * k % 0.5) * np.where(k % 2, -1, 1)
     more = (0.75 + golden**2 * k % 0.5) * np.where(k % 3, 1, -1)
@@ -257,7 +261,7 @@ def _shake(size: Array, i: Array) -> Array:
 
 
 def factorized_once(method, system, params: PyTree, dt):
-    """The factorised matrix of a linear system, in the place of `factorize`."""
+    """The factorised matrix of a linear system, used instead of `factorize`."""
     if system.knows_matrices and method.options.solve is None:
         return kept(step_matrix(method, system, params, dt))
     known = known_inverse(system)
@@ -265,12 +269,12 @@ def factorized_once(method, system, params: PyTree, dt):
 
 
 def known_inverse(system: FlatSystem):
-    """The solve with the matrix of the step, where its factors are known."""
+    """The solve with the matrix of the step, if its factors are known."""
     return None if system.factors is None else by_factors(system.factors.step)
 
 
 def factors_of(method, start, system: FlatSystem, dt: Array):
-    """The `Factors` of a linear system of constant matrices; start: the method with whose matrix a run starts."""
+    """The `Factors` of a linear system of constant matrices; start: the method whose matrix the start of a run uses."""
     if method.options.solve is not None:
         return None
     step, first = (dense_lu.lu(step_matrix(x, system, None, dt)) for x in (method, start))
@@ -279,9 +283,9 @@ def factors_of(method, start, system: FlatSystem, dt: Array):
 
 
 def linear_part(method, system, params: PyTree, dt: Array):
-    """A `Changing` that knows the linear part, and adds the Jacobian of a force beside it at each state.
+    """A `Changing` that has the linear part, and adds the Jacobian of the additional force at each state.
 
-    None where there is no such part to be kept; also of a linear system without friction, for which it is all.
+    None if there is no linear part to keep; also for a linear system without friction, which has no other part.
     """
     local = system.local
     if method.options.solve is not None:
@@ -294,7 +298,7 @@ def linear_part(method, system, params: PyTree, dt: Array):
 
 
 def with_local(A, local: Local, params: PyTree, inverse=None) -> Changing | ChangingSparse:
-    """The `Changing` of the matrix of the linear part, and the Jacobian of the force beside it."""
+    """The `Changing` of the matrix of the linear part and the Jacobian of the additional force."""
 
     def slope(s: State):
         return jax.linearize(lambda s: local.force(s.q, s.v, s.t, params), s)[1]
@@ -333,7 +337,7 @@ def linearized_step(
     where: str | None,
     again: bool = False,
 ):
-    """w at t + dt by one linearisation of r, about the state that `where` says, and its `Info`."""
+    """w at t + dt by one linearisation of r, about the state named by `where`, and its `Info`."""
     if where == "predictor":
         return linearized_solve(r, path, s.w, factorize, None, again)
     now = s._replace(t=s.t + dt)
@@ -366,14 +370,15 @@ def linearized_step(
 
 
 def linearize(f: Callable, x: Array | State):
-    """As JAX does it, with a tangent that can leave a jit, and is traced once, however often it is called."""
+    """As `jax.linearize`, with a tangent that can leave a jit, and is traced once, however often it is called."""
     value, tangent = jax.linearize(f, x)
     call, constants = hoisted(tangent, x)
     return value, jax.tree_util.Partial(call, constants)
 
 
 def better_state(r: Callable, predicted: State, held: State, size: Callable, limit: Array) -> State:
-    """The predicted state; or the held one, where the residual at the predicted is large, and the larger one."""
+    """The predicted state; or the held state, if the residual at the predicted state is large, and larger than at the
+    held one."""
     size = staged(lambda s, size=size: size(r(s)))
     predicted_size = size(predicted)
     use_predictor = lax.cond(predicted_size <= limit, lambda: jnp.array(True), lambda: predicted_size <= size(held))
@@ -381,9 +386,10 @@ def better_state(r: Callable, predicted: State, held: State, size: Callable, lim
 
 
 def better_solve(about: Callable, held: State, size: Callable, limit: Array):
-    """The solution about that state, with a second evaluation of r only where the first residual is large.
+    """The solution about the better state, with a second evaluation of r only if the first residual is large.
 
-    A branch around it all, and no choice of a state before it: the processor goes on while it waits for the residual.
+    The branch surrounds the whole solve, instead of a choice of the state before it: the processor can then continue
+    while it waits for the residual.
     """
     w, info, first = about(None)
     predicted_size = size(first.here)
@@ -396,7 +402,7 @@ def better_solve(about: Callable, held: State, size: Callable, limit: Array):
 
 
 def better_solve_in_turn(about: Callable, first: Callable, held: State, size: Callable, limit: Array):
-    """The same by a loop that is gone through once or twice: a large program then holds one expansion, not two.
+    """As `better_solve`, by a loop with one or two passes: a large program then contains one expansion, not two.
 
     first: () -> path(w) and the tangent of path."""
     known = start, _ = first()
@@ -419,7 +425,7 @@ def better_solve_in_turn(about: Callable, first: Callable, held: State, size: Ca
 
 
 def refresh(system: FlatSystem, params: PyTree, c, s, factorize):
-    """The state with the acceleration that its q and v ask for, w = M^-1 Q, and what the solve left."""
+    """The state with the acceleration w = M^-1 Q for its q and v, and the residual of the solve."""
     Q = system.force(s.q, s.v, s.t, params)
     w = system.acceleration(s.q, s.v, s.t, params, factorize)
     left = left_by(factorize, lambda w: system.inertia(s.q, w, s.t, params), Q, w)

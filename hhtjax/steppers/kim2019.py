@@ -1,7 +1,7 @@
 """The three steps of Kim et al. (2019), literally, for comparison and reproduction.
 
-M. Kim et al., J. Mech. Sci. Tech. 33(3), 2019, 1087-1096. For work, use `hht`: it is second order
-where these are not.
+M. Kim et al., J. Mech. Sci. Tech. 33(3), 2019, 1087-1096. For your own problems use `hht`, which has second order where
+these do not.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class KimHHT(Stepper):
         return State(t, q, v, system.acceleration(q, v, t, params))
 
     def bind(self, system: FlatSystem, params: PyTree, dt: Array):
-        """Eq. 10-14. The field w of the state holds a, which the recursion (12) carries on."""
+        """Eq. 10-14. The field w of the state holds a, which recursion (12) updates."""
         alpha = self.alpha
         beta, gamma = hht_coefficients(alpha)[2:]
 
@@ -71,7 +71,7 @@ class KimHHT(Stepper):
 
 @dataclass(frozen=True, eq=False)
 class ConventionalHHT(Stepper):
-    """The method Kim's step departs from; made by `conventional_hht`."""
+    """The method that Kim's step is derived from; made by `conventional_hht`."""
 
     alpha: Any
     order: int
@@ -156,9 +156,9 @@ def kim_hht(alpha: Real = 0.0) -> KimHHT:
         dq = h [v + (h/2)(1 - 2 beta/gamma) a + (beta/gamma) dv]
         a1 = dv/(h gamma) + (1 - 1/gamma) a
 
-    Order 2 only for alpha = 0 and forces without explicit time; order 1 otherwise. All tables of the
-    paper were computed with alpha = 0. `solution.acceleration` holds a, whose recursion never
-    meets the equation of motion again.
+    Order 2 only for alpha = 0 and forces without explicit time; order 1 otherwise. All tables of the paper were
+    computed with alpha = 0. `solution.acceleration` holds a. Its recursion never evaluates the equation of motion
+    again, so a does not satisfy it exactly.
 
     Args:
         alpha: in [-1/3, 0].
@@ -184,24 +184,25 @@ def conventional_hht(
 
         M(q1) a1 = (1 + alpha) Q(q1, v1, t~) - alpha Q(q, v, t),   t~ = t + (1 + alpha) h,
 
-    solved by Newton, q1 and v1 being Newmark's. Order 2 for constant M and forces without explicit time;
-    else 1, for every alpha but 0: M(q1) multiplies an acceleration of the time t + (1 + alpha) h, and the
-    weights and t~ count alpha twice. `hht(alpha, iterations=None)` is the method without these faults.
+    Newton solves it, with q1 and v1 from Newmark's formulas. Order 2 for alpha = 0, and for constant M and forces
+    without explicit time; otherwise order 1. The reasons: M(q1) multiplies an acceleration at the time t + (1 + alpha)
+    h, and the weights and t~ both contain alpha, so it counts twice. `hht(alpha, iterations=None)` is the method
+    without these faults.
 
-    With rotations and constraints it is the step of Cardona and Geradin (1989), Eq. 36 and 73-81: Phi(q1) = 0, with
-    B^T L among the forces; and in the chart of the rotation vector psi from R, forces of different times are compared
-    as those that work on psidot,
+    With rotations and constraints it is the step of Cardona and Geradin (1989), Eq. 36 and 73-81: Phi(q1) = 0, with B^T
+    L among the forces. In the chart of the rotation vector psi from R, forces at different times are combined as forces
+    conjugate to psidot,
 
         T(psi)^T [J A1 - (1 + alpha) Q1] + alpha Q = 0
 
-    which is of order 1 too, for every alpha but 0, unless J is spherical.
+    which has order 1 too, for every alpha but 0, unless J is spherical.
 
     Args:
         alpha: in [-1/3, 0].
         fictive_time: False for t~ = t + h, the form of Cardona and Geradin (1989), Eq. 79.
         tolerance, max_iterations: as in `hht`.
 
-    `solution.acceleration` holds a, which belongs to the time t + alpha h.
+    `solution.acceleration` holds a, which is the acceleration at the time t + alpha h.
 
     Returns:
         A `Stepper`.
@@ -221,12 +222,12 @@ def conventional_hht(
 
 
 def kim_implicit_euler() -> KimImplicitEuler:
-    """The non-iterative implicit Euler step Kim et al. (2019) compare with.
+    """The non-iterative implicit Euler step with which Kim et al. (2019) compare.
 
         a = M^-1 Q,   Jq = Q_q - (M a)_q                                        at (q, v, t)
         (M - h Q_v - h^2 Jq) dv = h (Q + h Jq v),   v1 = v + dv,   q1 = q + h v1
 
-    Order 1. The term (M a)_q, which the paper leaves out, is needed to find its numbers.
+    Order 1. The paper omits the term (M a)_q, but its numbers can only be reproduced with it.
 
     >>> import hhtjax
     >>> hhtjax.kim_implicit_euler().order

@@ -1,4 +1,4 @@
-"""Houbolt's and Park's methods: backward differences through four times, solved by Newton. Baselines.
+"""Houbolt's and Park's methods: backward differences over four times, solved by Newton. Classical baselines.
 
 J. Houbolt, J. Aeronautical Sciences 17, 1950, 540-550; K. Park, J. Applied Mechanics 42, 1975, 464-470.
 """
@@ -27,7 +27,7 @@ STARTER = rosenbrock(rho_inf=0.0)  # of the first two steps: order 2 and damped 
 
 
 class Memory(NamedTuple):
-    """q, v: (2, n), by how much they changed in the last step and in the one before; count: of the steps taken."""
+    """q, v: (2, n), their changes in the last step and in the one before; count: the number of steps taken."""
 
     q: PyTree
     v: PyTree
@@ -36,7 +36,7 @@ class Memory(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Multistep(Stepper):
-    """Base of both: `advance` is all that they do not share."""
+    """Base class of both methods, which differ only in `advance`."""
 
     order: int
     options: Options
@@ -49,17 +49,17 @@ class Multistep(Stepper):
         raise NotImplementedError
 
     def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
-        """w0 = M^-1 Q, and no past."""
+        """w0 = M^-1 Q, with an empty memory."""
         unknown = jnp.zeros((2, v.size), v.dtype)
         memory = Memory(unknown[:, : q.size], unknown, jnp.zeros((), jnp.int32))
         return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
 
     def jumped(self, system: FlatSystem, before, after, old, new, dt: Array, answer):
-        """`after`, where held inputs jump, with nothing to remember: what was before has another w."""
+        """`after`, where held inputs jump, with an empty memory, because w is different before the jump."""
         return after._replace(memory=after.memory._replace(count=jnp.zeros_like(after.memory.count)))
 
     def bind(self, system: FlatSystem, params: PyTree, dt: Array):
-        """Newton on M(q1) w1 = Q(q1, v1, t1); the first two steps are the starter's."""
+        """Newton on M(q1) w1 = Q(q1, v1, t1); the first two steps are taken by the starting method."""
         r = partial(residual, system, params)
         start = STARTER.bind(system, params, dt)
 
@@ -88,7 +88,7 @@ class Houbolt(Multistep):
     """Houbolt's method; made by `houbolt`."""
 
     def advance(self, system: FlatSystem, s: State, past: Memory, dt: Array, w: Array):
-        """By differences, which lose less to rounding than the q themselves."""
+        """Uses differences, which lose less to rounding than the values of q."""
         if not system.positions:
             return s.q, s.v + (6 * dt * w + 7 * past.v[0] - 2 * past.v[1]) / 11
         dq = (dt**2 * w + 3 * past.q[0] - past.q[1]) / 2
@@ -99,24 +99,24 @@ class Park(Multistep):
     """Park's method; made by `park`."""
 
     def advance(self, system: FlatSystem, s: State, past: Memory, dt: Array, w: Array):
-        """One formula, for v from w and for q from v."""
+        """The same formula gives v from w, and q from v."""
         v = s.v + (6 * dt * w + 5 * past.v[0] - past.v[1]) / 10
         return s.q + (system.located(6 * dt * v) + 5 * past.q[0] - past.q[1]) / 10, v
 
 
 def houbolt(tolerance: Real = 1e-10, max_iterations: int = 20) -> Houbolt:
-    """Houbolt's method: velocity and acceleration at t1 are those of the cubic through q1, q, q_-1, q_-2.
+    """Houbolt's method: velocity and acceleration at t1 are the derivatives of the cubic through q1, q, q_-1, q_-2.
 
         w1 = (2 q1 - 5 q + 4 q_-1 - q_-2)/h^2,   v1 = (11 q1 - 18 q + 9 q_-1 - 2 q_-2)/(6 h)
         M(q1) w1 = Q(q1, v1, t1)
 
-    Order 2, unconditionally stable, spectral radius 0 at infinite frequency. Of all methods of order 2 here it damps
-    low frequencies the most: a damping ratio of 5e-4 for omega h = 0.1. v is a quotient of differences of q, so it
-    holds a rounding error of 1e-16 |q|/h. A first-order system gets BDF3, y1' = (11 y1 - 18 y + 9 y_-1 - 2 y_-2)/(6 h),
-    of order 3.
+    Order 2, unconditionally stable, spectral radius 0 at infinite frequency. It damps low frequencies more than any
+    other method of order 2 here: the damping ratio is 5e-4 for omega h = 0.1. v is a difference quotient of q, so it
+    has a rounding error of 1e-16 |q|/h. A first-order system is solved by BDF3, y1' = (11 y1 - 18 y + 9 y_-1 - 2
+    y_-2)/(6 h), of order 3.
 
-    The first two steps, and two behind each jump of a held input, are those of `rosenbrock(rho_inf=0)`. Steps must be
-    of one size.
+    The first two steps, and two steps after each jump of a held input, are taken by `rosenbrock(rho_inf=0)`. Steps must
+    be equal.
 
     Args:
         tolerance, max_iterations: of Newton's iteration, as in `hht`.
@@ -138,14 +138,14 @@ def houbolt(tolerance: Real = 1e-10, max_iterations: int = 20) -> Houbolt:
 
 
 def park(tolerance: Real = 1e-10, max_iterations: int = 20) -> Park:
-    """Park's method: the mean of the backward differentiation formulas of two and of three steps.
+    """Park's method: the mean of the two-step and three-step backward differentiation formulas.
 
         v1 = (10 q1 - 15 q + 6 q_-1 - q_-2)/(6 h),   w1 = (10 v1 - 15 v + 6 v_-1 - v_-2)/(6 h)
         M(q1) w1 = Q(q1, v1, t1)
 
-    Order 2, unconditionally stable, spectral radius 0 at infinite frequency, with little damping at low ones: a damping
-    ratio of 8e-7 for omega h = 0.1. The first two steps, and two behind each jump of a held input, are those of
-    `rosenbrock(rho_inf=0)`. Steps must be of one size.
+    Order 2, unconditionally stable, spectral radius 0 at infinite frequency, with little damping at low frequencies:
+    the damping ratio is 8e-7 for omega h = 0.1. The first two steps, and two steps after each jump of a held input, are
+    taken by `rosenbrock(rho_inf=0)`. Steps must be equal.
 
     Args:
         tolerance, max_iterations: of Newton's iteration, as in `hht`.

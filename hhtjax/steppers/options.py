@@ -1,4 +1,4 @@
-"""The options of the generalised-alpha family: their names, kinds and defaults, and what is wrong with a value."""
+"""The options of the generalised-alpha family: names, kinds, defaults and checks."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ jax.tree_util.register_dataclass(Options, OPTIONS, [])
 
 
 class Keywords(TypedDict, total=False):
-    """The same for type checkers, which cannot read them off `Options` (a test compares them)."""
+    """`Options` for type checkers, which cannot derive them from the class (a test compares both)."""
 
     iterations: int | None
     linearize: Literal["predictor", "held", "state", "auto"] | None
@@ -55,7 +55,8 @@ class Keywords(TypedDict, total=False):
 
 
 def takes_options(constructor: Constructor) -> Constructor:
-    """A constructor whose `**options` are these: help() and completion list them, an unknown name is an error."""
+    """Gives a constructor these options as its `**options`: help() and completion list them, and an unknown name is an
+    error."""
     name, own = constructor.__name__, inspect.signature(constructor)
     kinds = get_type_hints(Options)
 
@@ -76,7 +77,7 @@ def takes_options(constructor: Constructor) -> Constructor:
 
 
 def check_options(caller: str, **keywords: Any) -> Options:
-    """`Options` with the default of `linearize` filled in, or an error that names what is wrong."""
+    """`Options` with the default of `linearize` filled in; raises an error that names a wrong value."""
     options = Options(**keywords)
     if options.iterations is not None:
         options = replace(options, iterations=require_integer(caller, "iterations", options.iterations))
@@ -104,7 +105,7 @@ def check_options(caller: str, **keywords: Any) -> Options:
 
 @cache
 def _words(name: str):
-    """What an option may be, by its annotation, which takes long to read."""
+    """The allowed values of an option, from its annotation. Reading annotations takes long, so the result is kept."""
     kind = get_type_hints(Options)[name]
     optional = type(None) in get_args(kind)
     return (*get_args(get_args(kind)[0] if optional else kind), *((None,) if optional else ()))
@@ -119,5 +120,5 @@ def _require_one_of(caller: str, name: str, options: Options):
 
 
 def require_alpha(caller: str, alpha: Real) -> Real:
-    """HHT's alpha as it is, if it lies in its range."""
+    """Returns HHT's alpha if it lies in its range."""
     return require_number(caller, "alpha", alpha, lambda x: -1 / 3 - 1e-12 <= x <= 0, "lie in [-1/3, 0]")

@@ -45,12 +45,12 @@ def hht_coefficients(alpha: Real) -> Coefficients:
 
 
 def weighted(weight: Real, x: Array) -> Real:
-    """weight x; nothing at all, not even a product, for a weight that is the number 0."""
+    """weight x; exactly 0, without a product, if the weight is the number 0."""
     return 0.0 if isinstance(weight, float) and weight == 0 else weight * x
 
 
 def advance(c: Coefficients, s: State, dt: Array, w: Array):
-    """Displacement from q, and the rest at t + dt, as an affine function of the new acceleration w."""
+    """The displacement from q, and v, w, a at t + dt, as affine functions of the new acceleration w."""
     a = (weighted(1 - c.alpha_f, w) + weighted(c.alpha_f, s.w) - weighted(c.alpha_m, s.a)) / (1 - c.alpha_m)
     x = dt * s.v + dt**2 * ((0.5 - c.beta) * s.a + c.beta * a)
     v = s.v + dt * ((1 - c.gamma) * s.a + c.gamma * a)

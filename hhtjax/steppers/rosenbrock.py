@@ -47,7 +47,8 @@ FEW = 4  # stages
 class Rosenbrock(Tabulated, Stepper):
     """A method given by its tableau; made by `rosenbrock`, `rowda` and `rodas5p`.
 
-    One of your own is its tableau and its order, here the linearly implicit trapezoidal rule with Euler's beside it:
+    To define your own method, give its tableau and order. Here: the linearly implicit trapezoidal rule, with Euler's
+    method embedded:
 
     >>> import hhtjax, jax.numpy as jnp
     >>> from hhtjax.steppers import Rosenbrock, RosenbrockTableau
@@ -68,7 +69,7 @@ class Rosenbrock(Tabulated, Stepper):
 
     @property
     def estimate_order(self) -> int:
-        """One more than the order of the embedded method, which is one less than that of this."""
+        """One more than the order of the embedded method, which is one below the order of this method."""
         return self.order
 
     def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array, estimating: bool = True):
@@ -126,17 +127,17 @@ def stages(
         return dt * (none + mean(weights, rates))
 
     def moved(h: Array, weights: Sequence, rates: PyTree) -> State:
-        """The state after the rates so weighted, at the time t + h."""
+        """The state after an increment with these weights, at the time t + h."""
         dq, dv, dw = increment(weights, rates)
         return State(s.t + h, s.q + system.located(dq), s.v + dv, s.w + dw)
 
     def start(a: Sequence, rates: PyTree):
-        """Where a stage starts, and r there."""
+        """The point at which a stage starts, and r there."""
         at = moved(sum(a) * dt, a, rates)
         return at, r(at)
 
     def stage(c: Sequence, rates: PyTree, at: State, value: Array) -> Array:
-        """Its rates."""
+        """The rates of a stage."""
         zq, zv, zw = increment(c, rates)
         kq = at.v + zv
         shift = State(gh + sum(c) * dt, system.located(zq + gh * kq), zv, -at.w)
@@ -151,7 +152,7 @@ def stages(
 
 
 def written_out(tableau: RosenbrockTableau, start: Callable, stage: Callable, first: tuple) -> PyTree:
-    """The rates of all stages. first: where the first starts, and r there."""
+    """The rates of all stages, unrolled. first: the point where the first stage starts, and r there."""
     started, before, rates = first, tableau.A[0], []
     for a, c in zip(tableau.A, tableau.G, strict=True):
         if a != before:
@@ -161,7 +162,7 @@ def written_out(tableau: RosenbrockTableau, start: Callable, stage: Callable, fi
 
 
 def in_a_loop(tableau: RosenbrockTableau, start: Callable, stage: Callable, first: tuple) -> PyTree:
-    """The same, with one stage to compile in the place of many; its tableau is data."""
+    """As `written_out`, in a loop: one stage is compiled instead of many, and the tableau is data."""
     number, size, dtype = len(tableau.b), first[1].size, first[1].dtype
     A, G = (jnp.asarray(filled(rows, number), dtype) for rows in (tableau.A, tableau.G))
 
@@ -178,13 +179,13 @@ def rosenbrock(rho_inf: Real = 0.0) -> Rosenbrock:
 
         g = (1/2)/(1 + sqrt((1 + rho)/2)),  A21 = g,  G21 = -2 g^2,  b = (1 - 1/(2 g), 1/(2 g))
 
-    Order 2, A-stable; L-stable for rho = 0. rho = (1 + alpha)/(1 - alpha) damps the highest frequencies as
-    `hht(alpha)` does. `solution.acceleration` is of order 2 too, but of order 1 for rho = 1. On linear systems its
-    error is half (rho = 0) to a quarter (rho = 1) of the trapezoidal rule's.
+    Order 2, A-stable; L-stable for rho = 0. rho = (1 + alpha)/(1 - alpha) damps the highest frequencies as `hht(alpha)`
+    does. `solution.acceleration` has order 2 too, but order 1 for rho = 1. On linear systems its error is half (rho =
+    0) to a quarter (rho = 1) of that of the trapezoidal rule.
 
-    Where it fails: its Jacobian is that of the start of the step, so a stiff direction that turns (an elastic pendulum
-    on its slow manifold), or a contact that begins within the step, can need a step up to 18 times as short
-    as that of `hht` (`python -m experiments stability`). Constraints are refused.
+    Where it fails: its Jacobian is evaluated at the start of the step. If a stiff direction turns (an elastic pendulum
+    on its slow manifold), or a contact begins within the step, it can need steps up to 18 times shorter than `hht`
+    (`python -m experiments stability`). It does not support constraints.
 
     Args:
         rho_inf: rho, the spectral radius at infinite frequency, in [0, 1]; a number, or a tracer to differentiate.
@@ -211,8 +212,8 @@ def rosenbrock(rho_inf: Real = 0.0) -> Rosenbrock:
 def rowda() -> Rosenbrock:
     """ROWDAIND2, the four-stage Rosenbrock method of order 3 of Lubich and Roche: one Jacobian, one factorisation.
 
-    Order 3, L-stable, g = 0.3; four solves and three residuals per step. Where the motion is resolved it has an eighth
-    of the error of converged HHT, or less; it fails where `rosenbrock` does. Constraints are refused.
+    Order 3, L-stable, g = 0.3; four solves and three residuals per step. Where the motion is resolved, its error is an
+    eighth of that of converged HHT, or less. It fails where `rosenbrock` does, and does not support constraints.
 
     References:
         Lubich, Roche, Computing 43, 1990, 325-342.
@@ -227,10 +228,10 @@ def rowda() -> Rosenbrock:
 def rodas5p() -> Rosenbrock:
     """Rodas5P, Steinebach's eight-stage Rosenbrock method of order 5: one Jacobian, one factorisation, eight solves.
 
-    Order 5, L-stable, g = 0.2119; its error estimate and its dense output are of order 4. For stiff motion that is
-    wanted to six digits and more, best under error control, `simulate(..., dt=adaptive(...))`: a step costs some nine
-    of `hht`. Constraints and rotations are refused; where steps do not resolve a stiff direction that turns it fails as
-    `rosenbrock` does.
+    Order 5, L-stable, g = 0.2119; its error estimate and its dense output have order 4. Use it for stiff motion to six
+    digits and more, best with error control, `simulate(..., dt=adaptive(...))`: a step costs as much as some nine steps
+    of `hht`. It does not support constraints and rotations. If steps do not resolve a stiff direction that turns, it
+    fails as `rosenbrock` does.
 
     Returns:
         A `Stepper`.

@@ -1,8 +1,9 @@
 """Explicit Runge-Kutta methods, for the first-order form (q, v)' = (v, M^-1 Q), each given by its tableau.
 
-Stage i starts from y_i = y + h sum_j A_ij k_j, at t + c_i h, c_i = sum_j A_ij, where its rates k_i are taken; the step
-ends at y1 = y + h sum_i b_i k_i. The rate there is the first of the next step. A method for error control has weights
-of an error, too, e = h sum_i e_i k_i, and one with dense output the weights of what that adds to cubics.
+Stage i starts from y_i = y + h sum_j A_ij k_j, at t + c_i h with c_i = sum_j A_ij, where its rates k_i are evaluated.
+The step ends at y1 = y + h sum_i b_i k_i. The rate at the end is the first one of the next step. A method for error
+control also has weights of an error, e = h sum_i e_i k_i. A method with dense output has weights of a correction to the
+cubic.
 
 E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, Sec. II.1 to II.6.
 """
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 class RungeKutta(Tabulated, Stepper):
     """A method given by its tableau; made by `rk4`, `tsit5`, `dopri5` and `dop853`.
 
-    One of your own is its tableau and its order:
+    To define your own method, give its tableau and order:
 
     >>> import hhtjax, jax.numpy as jnp
     >>> from hhtjax.steppers import ExplicitTableau, RungeKutta
@@ -56,7 +57,7 @@ class RungeKutta(Tabulated, Stepper):
         return None if self.tableau.embedded_order is None else self.tableau.embedded_order + 1
 
     def bind_pair(self, system: FlatSystem, params: PyTree, dt: Array, estimating: bool = True):
-        """State -> State, Info, Errors; the first stage is the acceleration that the step before ended with."""
+        """State -> State, Info, Errors; the first stage uses the acceleration at the end of the previous step."""
         tableau = self.tableau
         acceleration = staged(lambda q, v, t: system.acceleration(q, v, t, params), system.size)
         rows = *tableau.A, tableau.b, *tableau.extra
@@ -64,7 +65,7 @@ class RungeKutta(Tabulated, Stepper):
 
         def step(s: State):
             def moved(weights: Sequence, rates: PyTree):
-                """q and v after the rates so weighted."""
+                """q and v after an increment with these weights."""
                 x, y = dt * mean(weights, rates)
                 return s.q + system.located(x), s.v + y
 
@@ -83,7 +84,7 @@ class RungeKutta(Tabulated, Stepper):
 
 
 def written_out(rows: Sequence, stage: Callable, first: Array) -> PyTree:
-    """The rates of all stages; first: those of the first."""
+    """The rates of all stages, unrolled; first: the rates of the first stage."""
     rates = [first]
     for row in rows:
         rates.append(stage(row, rates))
@@ -91,7 +92,7 @@ def written_out(rows: Sequence, stage: Callable, first: Array) -> PyTree:
 
 
 def in_a_loop(rows: Sequence, stage: Callable, first: Array) -> Array:
-    """The same, with one stage to compile in the place of many; the tableau is data."""
+    """As `written_out`, in a loop: one stage is compiled instead of many, and the tableau is data."""
     number, dtype = len(rows) + 1, first.dtype
 
     def body(rates: Array, row: tuple):
@@ -103,7 +104,7 @@ def in_a_loop(rows: Sequence, stage: Callable, first: Array) -> Array:
 
 
 def errors_of(tableau: ExplicitTableau, dt: Array, rates: PyTree) -> Array:
-    """Of q and v, (2, N)."""
+    """The errors of q and v, (2, N)."""
     e = dt * mean(tableau.error, rates)
     if tableau.error_of_3 is None:
         return e
@@ -114,7 +115,7 @@ def errors_of(tableau: ExplicitTableau, dt: Array, rates: PyTree) -> Array:
 
 
 def mean(weights: PyTree, rates: PyTree) -> Any:
-    """The sum of the rates so weighted, of as many as there are weights, without those that are known to be 0."""
+    """The weighted sum of the first len(weights) rates, without terms whose weight is known to be 0."""
     known = [(weight, k) for weight, k in zip(weights, rates, strict=False) if not is_concrete(weight) or weight]
     return sum(weight * k for weight, k in known)
 
@@ -122,8 +123,8 @@ def mean(weights: PyTree, rates: PyTree) -> Any:
 def rk4() -> RungeKutta:
     """The classical Runge-Kutta method, for the first-order form (q, v)' = (v, M^-1 Q).
 
-    Order 4, explicit: four solves with M per step, and unstable once w h > 2.83 for any natural
-    frequency w of the system, resolved or not. The method of choice where nothing is stiff.
+    Order 4, explicit: four solves with M per step. Unstable once w h > 2.83 for any natural frequency w of the system,
+    whether it is resolved or not. A good choice if nothing is stiff.
 
     >>> import hhtjax
     >>> hhtjax.rk4().order
@@ -135,9 +136,10 @@ def rk4() -> RungeKutta:
 def dopri5() -> RungeKutta:
     """Dormand and Prince's pair of order 5(4), for the first-order form (q, v)' = (v, M^-1 Q).
 
-    Explicit: six solves with M per step, and unstable once w h > 1 for any undamped natural frequency w of the system
-    (which grows by 1e-4 a step at w h = 1.1, by 3e-2 at 2), or r h > 3.3 for any rate r of a decay. For error control,
-    `simulate(..., dt=adaptive(...))`, of what is not stiff; it refuses constraints and rotations.
+    Explicit: six solves with M per step. Unstable once w h > 1 for any undamped natural frequency w of the system
+    (which then grows by 1e-4 a step at w h = 1.1, by 3e-2 at 2), or r h > 3.3 for any decay rate r. Use it with error
+    control, `simulate(..., dt=adaptive(...))`, for motion that is not stiff. It does not support constraints and
+    rotations.
 
     References:
         Dormand, Prince, J. Comput. Appl. Math. 6, 1980, 19-26, Table 2; dense output of order 4: Shampine, Math. Comp.
@@ -153,8 +155,8 @@ def dopri5() -> RungeKutta:
 def tsit5() -> RungeKutta:
     """Tsitouras' pair of order 5(4), for the first-order form (q, v)' = (v, M^-1 Q): as `dopri5`, with smaller errors.
 
-    Explicit: six solves with M per step; an undamped vibration of frequency w grows by 1e-4 a step at w h = 1, by 3e-2
-    at 2, and r h must be below 3.5 for any rate r of a decay. Dense output of order 4.
+    Explicit: six solves with M per step. An undamped vibration of frequency w grows by 1e-4 a step at w h = 1, by 3e-2
+    at 2, and r h must be below 3.5 for any decay rate r. Dense output of order 4.
 
     References:
         Tsitouras, Computers & Mathematics with Applications 62, 2011, 770-775.
@@ -170,8 +172,8 @@ def dop853() -> RungeKutta:
     """Dormand and Prince's method of order 8(5,3) of Hairer and Wanner, for (q, v)' = (v, M^-1 Q).
 
     Explicit: fifteen solves with M per step, of which three are for dense output, of order 7. Unstable once w h > 5.9
-    for any undamped natural frequency w of the system, or r h > 6.3 for any rate r of a decay. Under error control the
-    explicit method for seven to ten digits of what `taylor` refuses.
+    for any undamped natural frequency w of the system, or r h > 6.3 for any decay rate r. With error control it is the
+    explicit method for seven to ten digits of systems that `taylor` does not support.
 
     References:
         Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, 2nd ed., Sec. II.5, II.6 and II.10.

@@ -1,8 +1,8 @@
-"""A start from which steps go on smoothly, though damping may be far too stiff for their size.
+"""The smooth start: a start after which steps are smooth, although damping may be far too stiff for their size.
 
-What is light and strongly damped takes a time m/c, far below a step h, to lose the velocity that does not fit its
-forces. The acceleration at that start, M^-1 Q, is as large as 1/m. The recursion keeps it, and leaves
-h^2 w (1/2 - beta/gamma) of it in q: any multiple of F/k. So a step begins behind that time instead:
+A light, strongly damped coordinate loses the part of its velocity that does not fit its forces in a time m/c, far below
+a step h. The acceleration at the start, M^-1 Q, is proportional to 1/m. The recursion keeps it, and adds h^2 w (1/2 -
+beta/gamma) to q: any multiple of F/k. So the step starts after that time instead:
 
     S = M + h gamma C + h^2 beta K,      C = -dQ/dv,  K = -dQ/dq
     M dv = h gamma Q(q + h (beta/gamma) dv, v + dv, t)     an implicit step of the velocity: by Newton, with S
@@ -10,18 +10,18 @@ h^2 w (1/2 - beta/gamma) of it in q: any multiple of F/k. So a step begins behin
     v+ = v + P^4 [1 + (5 - 2 gamma) (1 - P)] dv
     w <- w + S^-1 [Q(q, v+, t) - M w],  five times from 0 (see `Corrections`)
 
-Where the step resolves the motion v+ - v is O(h^5), and w is M^-1 Q but for O(h^5): order and error constants stay.
-Elsewhere w is bounded. Forces without dissipation, such as gyroscopic ones, have an antisymmetric C, and move no
-velocity. Where C + C^T is 0 nothing changes at all: the recursion throws no spring by its M^-1 Q.
+Where the step resolves the motion, v+ - v is O(h^5), and w differs from M^-1 Q by O(h^5), so order and error constants
+do not change. Elsewhere w is bounded. Forces without dissipation, such as gyroscopic ones, have an antisymmetric C, and
+change no velocity. If C + C^T is 0 nothing changes at all, because the recursion does not throw a spring by its M^-1 Q.
 
-While its velocity changes a coordinate falls back by m/c dv. Here v+ is that of the end, and what the recursion makes
-of the rest, v + dv - v+, is half a step of it. With the factor [1 + ...], whose slope at P = 1 is that of P^(2 gamma),
-both are the same, but for the square of m/(c h): 1 - 50 q - 5 v from rest ends 4e-4 off at most with any mass and
-hht(-.05), h = 1e-3, where P^4 alone leaves 1e-3.
+While its velocity changes, a coordinate falls behind by m/c dv. v+ is the velocity at the end of this phase. The
+recursion treats the rest, v + dv - v+, as half a step of it. With the factor [1 + ...], whose slope at P = 1 is that of
+P^(2 gamma), the two agree up to the square of m/(c h): 1 - 50 q - 5 v from rest has an error of 4e-4 at most for any
+mass with hht(-.05), h = 1e-3; P^4 alone leaves 1e-3.
 
-With constraints all solves are those with [S -B^T; B 0]: B dv = h g (-curvature), B P = 0, and w with its multipliers.
-Where an input jumps between two steps, dQ = Q(new) - Q(old) takes the place of Q, and dv, dw and dL are changes.
-Internal states z, which may be far faster than h, keep theirs.
+With constraints all solves use [S -B^T; B 0]: B dv = h g (-curvature), B P = 0, and w has its multipliers. Where an
+input jumps between two steps, dQ = Q(new) - Q(old) replaces Q, and dv, dw and dL are changes. Internal states z, which
+may be far faster than h, keep their rates.
 """
 
 from __future__ import annotations
@@ -69,10 +69,10 @@ LATER = 1 / 16  # of h, for the rate of accelerations
 
 
 class Corrections(NamedTuple):
-    """w+ by `number` corrections, of which the last counts `last` times.
+    """w+ by `number` corrections, of which the last is applied `last` times.
 
-    With R = 1 - S^-1 M, which is 1 where damping is stiff, w+ is (1 - R^5) M^-1 Q by default, and in that limit 1/h of
-    what v+ lacks."""
+    With R = 1 - S^-1 M, which is 1 where damping is stiff, w+ is (1 - R^5) M^-1 Q by default. In that limit it is 1/h
+    times the velocity that v+ lacks."""
 
     number: int
     last: float
@@ -82,11 +82,11 @@ DEFAULT = Corrections(5, 1.0)
 
 
 class Layer(NamedTuple):
-    """What is left of the equations at a start, or at a jump.
+    """The equations at a start, or at a jump.
 
-    base: the state, with accelerations and multipliers to which unknown changes z = (dw, dL) are added. offset: what
-    rows are to be. X, V: displacement and velocity by a unit of dw. bend: of constraints, None without; B: their
-    gradient, None too where it is sparse. M: None where it is not formed."""
+    base: the state, with accelerations and multipliers to which unknown changes z = (dw, dL) are added. offset: the
+    required values of the rows. X, V: displacement and velocity per unit of dw. bend: of constraints, None without; B:
+    their gradient, also None if it is sparse. M: None if it is not formed."""
 
     system: Any
     params: PyTree
@@ -100,7 +100,7 @@ class Layer(NamedTuple):
 
     @classmethod
     def of(cls, method, system: FlatSystem, params: PyTree, h: Array, base: State, offset: float = 0.0) -> Layer:
-        """In a step h."""
+        """The layer for a step h."""
         c = method.coefficients
         B = bend = None
         if system.num_constraints:
@@ -109,11 +109,11 @@ class Layer(NamedTuple):
         return cls(system, params, base, offset, c.beta * h**2, c.gamma * h, B, bend)
 
     def data(self) -> Layer:
-        """What may be arguments of a function of JAX: all but the system."""
+        """The fields that can be arguments of a JAX function: all but the system."""
         return self._replace(system=None)
 
     def with_data(self, data: PyTree) -> Layer:
-        """The layer with these."""
+        """The layer with these fields."""
         return data._replace(system=self.system)
 
     def located(self, x: Array) -> Array:
@@ -138,14 +138,14 @@ class Layer(NamedTuple):
         return reaction(self.system, self.base.q, self.base.t, self.params, L)
 
     def path(self, z: Array):
-        """The state behind the implicit step, given the changes of acceleration and multipliers."""
+        """The state after the implicit step, for given changes of acceleration and multipliers."""
         base, (dw, dL) = self.base, self.parts(z)
         L = None if dL is None else base.L + dL
         q = self.system.move(base.q, self.X * dw)
         return State(base.t, q, base.v + self.located(self.V * dw), base.w + dw, L=L)
 
     def rows(self, s: State, bend: Array | None = None) -> Array:
-        """What is to be zero: M w - Q - B^T L, and B w + curvature."""
+        """The rows that must be zero: M w - Q - B^T L, and B w + curvature."""
         force = residual(self.system, self.params, s)
         if self.bend is None:
             return force - self.offset
@@ -155,7 +155,7 @@ class Layer(NamedTuple):
         return jnp.concatenate([force - self.pull(s.L), self.push(s.w) + bend]) - self.offset
 
     def product(self, z: Array):
-        """The part of the rows that z enters at the start itself: M dw - B^T dL, B dw."""
+        """The part of the rows that depends on z at the start itself: M dw - B^T dL, B dw."""
         dw, dL = self.parts(z)
         force = self.inertia(dw)
         return force if dL is None else jnp.concatenate([force - self.pull(dL), self.push(dw)])
@@ -187,11 +187,11 @@ def smoothed(
     finish: Callable | None = None,
     lags: bool = False,
 ) -> State:
-    """The state from which the first step h goes, behind the layer at the start s.
+    """The state from which the first step h starts, after the layer at the start s.
 
-    moves: whether v becomes v+. resolves: whether there is no layer, as in steps far below h, whose S is M.
-    alone: whether no kernel is around. finish: what is made of the implicit step, by default `finished`. lags: whether
-    a keeps what it is away from w, as far as the step resolves that.
+    moves: whether v becomes v+. resolves: whether there is no layer, as for steps far below h, for which S is M. alone:
+    whether no kernel surrounds it. finish: computes the result from the implicit step, by default `finished`. lags:
+    whether a keeps its difference from w, as far as the step resolves it.
     """
     damped, corrects = reads_velocity(system, s, params), method.corrects(system) and not lags
     if not (system.num_constraints or damped or corrects):
@@ -226,9 +226,9 @@ def jumped(
     answer: Callable,
     anew: Callable | None = None,
 ) -> State:
-    """The state behind a jump of held inputs: `after`, but where what damps is stiff.
+    """The state after a jump of held inputs: `after`, unless damping is stiff.
 
-    anew: the start from s with other params and h, in the place of changes to s: of dry friction, which is not linear.
+    anew: the start from s with other params and h, instead of changes to s; used for dry friction, which is not linear.
     """
     new = both[1]
     if not reads_velocity(system, s, new):
@@ -252,10 +252,10 @@ def jumped(
 def grown(
     method: Stepper, system: FlatSystem, s: State, params: PyTree, h: Array, smooth: Callable = smoothed
 ) -> State:
-    """The state from which a step h goes that is far longer than those before.
+    """The state from which a step h starts that is far longer than those before.
 
-    Where accelerations change by LEAVES of them within h, and damping is stiff, it is that of a smooth start: short
-    steps have left what long ones cannot follow. Elsewhere, as on a slow manifold, it is s."""
+    If accelerations change by the fraction LEAVES within h, and damping is stiff, it is the state of a smooth start:
+    short steps have left what long ones cannot follow. Otherwise, as on a slow manifold, it is s."""
     if not reads_velocity(system, s, params):
         return s
     answer = answers(system, s.q, s.t, params, method.redundant)
@@ -289,19 +289,19 @@ def reads_velocity(system: FlatSystem, s: State, params: PyTree) -> bool:
 
 
 def by_factors(method: Beginning | GeneralizedAlpha, system: FlatSystem) -> bool:
-    """Whether the matrix of the implicit step is one of a linear system that is factorised, not inverted."""
+    """Whether the matrix of the implicit step belongs to a linear system that is factorised, not inverted."""
     return system.linear and (system.size > UNROLLED or method.options.solve is not None)
 
 
 def factors(method, system, params: PyTree, V):
-    """What the matrix of the implicit step is factorised by. V: h gamma."""
+    """The factorisation of the matrix of the implicit step. V: h gamma."""
     if system.factors is not None:
         system = system._replace(factors=system.factors._replace(step=system.factors.start))
     return at_start(method).factorization(system, params, V / method.coefficients.gamma)
 
 
 def at_start(method):
-    """The method whose step the implicit one is: Newmark's."""
+    """The method of the implicit step: Newmark's."""
     c = method.coefficients
     return replace(method, coefficients=Coefficients(0.0, 0.0, c.beta, c.gamma))
 
@@ -309,9 +309,10 @@ def at_start(method):
 def without_layer(
     method, layer: Layer, h: Array, damped: bool, corrects: bool, finish: Callable, factorize: Callable | None = None
 ) -> Found:
-    """What `finish` makes of the implicit step: a `Found`. factorize: `factors`, where they are known.
+    """The result of `finish` for the implicit step: a `Found`. factorize: `factors`, if they are known.
 
-    Small matrices are formed, once: what is differentiated then is products of these, and the force in one place.
+    Small matrices are formed once. What is differentiated then consists of products with these, and of the force in one
+    place.
     """
     options = method.options
 
@@ -346,16 +347,16 @@ def without_layer(
 
 
 class Drag(NamedTuple):
-    """The map (C + C^T)/2, and whether it takes energy from every motion; None where that is asked only of the motions
-    that P leads to, as of large systems."""
+    """The map (C + C^T)/2, and whether it takes energy from every motion; None if this is only tested for the motions
+    that P produces, as for large systems."""
 
     of: Any
     dissipates: Array | None = None
 
 
 class Found(NamedTuple):
-    """Behind a layer: v+, the changes z = (dw, dL), dw/dt where it is asked for, whether anything damps at all, dry
-    friction where there is some, and a - w where it is kept."""
+    """The values after a layer: v+, the changes z = (dw, dL), dw/dt if needed, whether there is any damping, dry
+    friction if there is any, and a - w if it is kept."""
 
     v: PyTree
     z: PyTree
@@ -374,7 +375,7 @@ def finished(
     h: Array,
     corrects: bool,
 ) -> Found:
-    """The `Found`, from the solve with the matrix of the step, the map C, and z behind the implicit step."""
+    """The `Found`, from the solve with the matrix of the step, the map C, and z after the implicit step."""
     v, bend = layer.base.v, layer.bend
     if drag is not None:
         v = v + damped_part(layer, inverse, drag, layer.located(layer.V * z[: v.size]), h)
@@ -389,14 +390,14 @@ def finished(
 
 
 def expanded(layer: Layer, invert: Callable):
-    """What Newton's step from 0 leads to, the inverse of the matrix of the step there, and C."""
+    """The result of Newton's step from 0, the inverse of the matrix of the step there, and C."""
     z = layer.zeros()
     dz, _, (inverse, C) = expansion(layer, z, invert)
     return z - dz, inverse, C
 
 
 def expansion(layer: Layer, z: Array, invert: Callable = inverse):
-    """Newton's step at z, the energy that it is worth, and the inverse and C, from one loop over columns."""
+    """Newton's step at z, its energy, and the inverse and C, from one loop over columns."""
     system, base, n = layer.system, layer.base, layer.system.size
     dw, dL = layer.parts(z)
 
@@ -420,7 +421,7 @@ def expansion(layer: Layer, z: Array, invert: Callable = inverse):
 
 
 def searched(layer: Layer):
-    """The same as `expanded` where Newton's method ends."""
+    """As `expanded`, at the end of Newton's method."""
     n, N = layer.system.size, layer.zeros().size
     empty = jnp.zeros((N, N), layer.base.v.dtype), jnp.zeros((n, n), layer.base.v.dtype)
     z, dz, (inverse, C) = improved(partial(expansion, layer), layer.zeros(), empty)
@@ -428,7 +429,7 @@ def searched(layer: Layer):
 
 
 def differentiable(layer: Layer):
-    """The same, with derivatives: those of Newton's step where it ends, which are exact of order 2^k - 1 after k."""
+    """As above, with derivatives: those of Newton's step at its end, which are exact to order 2^k - 1 after k steps."""
     find, constants = hoisted(lambda: searched(layer))
     found = lax.stop_gradient(find(lax.stop_gradient(constants)))
 
@@ -441,7 +442,7 @@ def differentiable(layer: Layer):
 
 
 def newton_step(layer: Layer, factorize: Callable | Given | Constant, z: Array):
-    """The solve with the matrix at z, the z that it leads to, and the tangent of the rows."""
+    """The solve with the matrix at z, the next z, and the tangent of the rows."""
     at, along = jax.linearize(layer.path, z)
     value, tangent = linearize_rows(layer.rows, at)
     inverse = factorize_map(lambda dz: tangent(along(dz)), value, around(factorize, lambda: (at, along)))
@@ -449,7 +450,7 @@ def newton_step(layer: Layer, factorize: Callable | Given | Constant, z: Array):
 
 
 def at_root(layer: Layer, factorize: Callable | Given | Constant):
-    """The same where Newton's method ends; differentiated by the implicit-function theorem."""
+    """As above, at the end of Newton's method; differentiated by the implicit-function theorem."""
     n = layer.system.size
 
     def f(z):
@@ -470,7 +471,7 @@ def at_root(layer: Layer, factorize: Callable | Given | Constant):
 
 
 def searched_by_maps(layer: Layer, factorize: Callable | Given | Constant):
-    """The same as `at_root`, without derivatives: its loop hands on the maps found last, so that none is twice."""
+    """As `at_root`, without derivatives: its loop passes on the last maps, so that none is computed twice."""
     n = layer.system.size
 
     def around_it(z: Array):
@@ -487,7 +488,7 @@ def searched_by_maps(layer: Layer, factorize: Callable | Given | Constant):
 
 
 def damping(layer: Layer, factorize: Callable | Given | Constant, tangent: Callable):
-    """The map (C + C^T)/2 at a state, and whether it is anything but 0."""
+    """The map (C + C^T)/2 at a state, and whether it is different from 0."""
     v = layer.base.v
     zero = jax.tree.map(jnp.zeros_like, jax.eval_shape(layer.path, layer.zeros()))
 
@@ -507,9 +508,9 @@ def damping(layer: Layer, factorize: Callable | Given | Constant, tangent: Calla
 
 
 def dissipates(layer: Layer, C: Array):
-    """Whether h gamma x^T C x > -GAINED x^T M x for all x: else P grows what it should take away.
+    """Whether h gamma x^T C x > -GAINED x^T M x for all x. Otherwise P would amplify what it should remove.
 
-    So it is of every damper, and not of a feedback without reaction, whose C is not symmetric. None where M is sparse.
+    This holds for every damper, but not for a feedback without reaction, whose C is not symmetric. None if M is sparse.
     """
     if layer.system.matrices is not None:
         return None
@@ -532,9 +533,9 @@ def dissipates(layer: Layer, C: Array):
 def damped_part(
     layer: Layer, inverse: Callable, drag: Drag, dv: Array, h: Array, project: Callable = lambda x: x
 ) -> Array:
-    """P^4 [1 + (5 - 2 gamma) (1 - P)] dv, or 0 where C gives energy.
+    """P^4 [1 + (5 - 2 gamma) (1 - P)] dv, or 0 where C supplies energy.
 
-    project: what keeps P x among the velocities that may change.
+    project: keeps P x among the velocities that may change.
     """
 
     def power(_, carry: tuple):
@@ -557,7 +558,7 @@ def response(layer: Layer, inverse: Callable, force: Array) -> Array:
 
 
 def corrected_by(layer: Layer, inverse: Callable, left: Array, corrections: Corrections = DEFAULT) -> Array:
-    """z with product(z) = -left, as far as the corrections go."""
+    """z with product(z) = -left, to the accuracy of the corrections."""
 
     def correct(_, z: Array) -> Array:
         return z - inverse(left + layer.product(z))
@@ -574,7 +575,7 @@ def corrected_by(layer: Layer, inverse: Callable, left: Array, corrections: Corr
 
 
 def lag_left(layer: Layer, inverse: Callable):
-    """Of a - w, which the layer's state holds as its a, what the step resolves."""
+    """The part of a - w that the step resolves; the layer's state holds a - w as its a."""
     lag = layer.base.a
     if lag is None:
         return None
@@ -583,8 +584,9 @@ def lag_left(layer: Layer, inverse: Callable):
 
 
 def rate_of(layer: Layer, s: State, inverse: Callable, h: Array) -> Array:
-    """(dw/dt, dL/dt) at the state s, by the same corrections: a difference, over far less than h, for what is to be of
-    first order in h. A derivative would be one of third order of the constraints, and long to compile."""
+    """(dw/dt, dL/dt) at the state s, by the same corrections: a difference quotient over a time far below h, which is
+    sufficient for first order in h. A derivative would need the third derivative of the constraints, and compile for
+    long."""
     system, params = layer.system, layer.params
 
     def rows(later: Array) -> Array:

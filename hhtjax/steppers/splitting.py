@@ -1,8 +1,8 @@
-"""Operator splitting: implicit in the initial tangent, explicit in the rest. A baseline.
+"""Operator splitting: implicit with the initial tangent, explicit for the rest of the force. A baseline.
 
 M. Nakashima, T. Kaminosono, M. Ishida, K. Ando, 4th U.S. Nat. Conf. Earthquake Eng., 1990; D. Combescure, P. Pegon,
-Soil Dyn. Earthquake Eng. 16, 1997, 427-443: the methods that Kim et al. (2019) set theirs against (refs. 12-14). For
-work, use `hht`, which linearises anew in every step.
+Soil Dyn. Earthquake Eng. 16, 1997, 427-443: the methods with which Kim et al. (2019) compare (refs. 12-14). For your
+own problems use `hht`, which linearises anew in every step.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class Memory(NamedTuple):
-    """K, C: initial stiffness and damping, (n, n); P: the weighted force that the last step ended with, (n,)."""
+    """K, C: initial stiffness and damping, (n, n); P: the weighted force at the end of the last step, (n,)."""
 
     K: Array
     C: Array
@@ -43,7 +43,7 @@ class OperatorSplitting(Stepper):
     order: int
 
     def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
-        """a_0 = M^-1 Q, and the tangent that the whole run keeps."""
+        """a_0 = M^-1 Q, and the tangent used for the whole run."""
         K, C = (-jax.jacfwd(system.force, argnums=i)(q, v, t, params) for i in (0, 1))
         memory = Memory(system.widened(K), C, self.weighted_force(system, q, v, t, params))
         return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
@@ -58,27 +58,27 @@ class OperatorSplitting(Stepper):
         resolves: bool = False,
         alone: bool = False,
     ) -> State:
-        """The state from which the first step goes, as of the `hht` family."""
+        """The state from which the first step starts, as in the `hht` family."""
         s = self.hht.smoothed(system, state._replace(memory=None), params, dt, moves, resolves, alone)
         return self.begun(system, s, params, state.memory)
 
     def begun(self, system: FlatSystem, s: State, params: PyTree, memory: Memory) -> State:
-        """A state of the `hht` family as one of this method."""
+        """Converts a state of the `hht` family to one of this method."""
         left = system.residual(s.q, s.v, s.w, s.t, params)  # not 0 of what is stiff
         P = self.weighted_force(system, s.q, s.v, s.t, params) + left
         return s._replace(a=None, memory=memory._replace(P=P))
 
     def throws(self, system):
-        """Unless there are no positions."""
+        """True if there are positions."""
         return system.positions > 0
 
     def grown(self, system: FlatSystem, state, params: PyTree, dt: Array):
-        """As of the `hht` family."""
+        """As in the `hht` family."""
         s = self.hht.grown(system, state._replace(a=state.w, memory=None), params, dt)
         return tree_where(jnp.any(s.v != state.v), self.begun(system, s, params, state.memory), state)
 
     def jumped(self, system: FlatSystem, before, after, old, new, dt: Array, answer):
-        """The same where held inputs jump, of the changes."""
+        """The state after a jump of held inputs, as in `hht`; P is updated by the change of the forces."""
         K, C, P = before.memory
         both = before._replace(memory=None), after._replace(memory=None)
         s = self.hht.jumped(system, *both, old, new, dt, answer)
@@ -92,11 +92,11 @@ class OperatorSplitting(Stepper):
 
     @property
     def hht(self) -> Stepper:
-        """The method of which it is, on linear systems."""
+        """The method of the `hht` family to which it is equal on linear systems."""
         return GeneralizedAlpha(hht_coefficients(self.alpha), 2, check_options("operator_splitting"))
 
     def weighted_force(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) -> Array:
-        """P, what alpha weighs: Q, or in the modified form Q at rest."""
+        """P, the force that alpha weighs: Q, or in the modified form Q at rest."""
         return system.force(q, jnp.zeros_like(v) if self.modified else v, t, params)
 
     def bind(self, system: FlatSystem, params: PyTree, dt: Array):
@@ -124,36 +124,38 @@ class OperatorSplitting(Stepper):
 
 
 def operator_splitting(alpha: Real = -0.05, modified: bool = False) -> OperatorSplitting:
-    """The alpha-operator-splitting method: one solve in a step, no Jacobian but the one at the start.
+    """The alpha-operator-splitting method: one solve per step, and no Jacobian but the one at the start.
 
         q~ = q + h v + h^2 (1/2 - beta) a,   v~ = v + h (1 - gamma) a,   beta = (1 - alpha)^2/4,  gamma = 1/2 - alpha
         q1 = q~ + h^2 beta a1,   v1 = v~ + h gamma a1
         Q1 = Q(q~, v~, t1) - K0 (q1 - q~) - C0 (v1 - v~),   K0 = -Q_q,  C0 = -Q_v  at the start of the run
         M(q~) a1 = Q1 + alpha (P1 - P)
 
-    P is Q. With `modified` it is the force at rest, P1 = Q(q~, 0, t1) - K0 (q1 - q~): alpha then weighs no damping.
-    The sources have a constant M, and XLA then factorises once in a run. M(q~) extends them; -(M a)_q is not in K0.
+    P is Q. With `modified` it is the force at rest, P1 = Q(q~, 0, t1) - K0 (q1 - q~), so alpha does not weigh the
+    damping. The sources assume a constant M; XLA then factorises it once per run. M(q~) is an extension, and K0 does
+    not contain -(M a)_q.
 
-    Order 2 for constant M and C = -Q_v, with any stiffness and explicit time; `modified` with alpha other than 0 only
-    where C = 0. Else 1: v~ is O(h) off, and so is every force of velocity that C0 does not hold (centrifugal ones:
-    every mechanism). `order` is the one for constant M and C. On linear systems the standard form is `hht(alpha)`.
-    Of a `FirstOrderSystem` v~ = y + h (1 - gamma) y' + h gamma y' = y + h y', and the order the same for any f(y, t).
+    Order 2 for constant M and C = -Q_v, with any stiffness and explicit time; with `modified` and alpha other than 0
+    only if C = 0. Otherwise order 1: v~ has an error O(h), and so has every velocity-dependent force that C0 does not
+    contain (such as centrifugal forces, so every mechanism). `order` is the one for constant M and C. On linear systems
+    the standard form is equal to `hht(alpha)`. For a `FirstOrderSystem` v~ = y + h (1 - gamma) y' + h gamma y' = y + h
+    y', and the order is the same for any f(y, t).
 
-    An undamped oscillator m, of stiffness k now and k0 at the start, is stable for
+    An undamped oscillator of mass m, with stiffness k now and k0 at the start, is stable for
 
         -4 alpha k <= (1 - alpha)^2 k0    and    h^2 [(1 - 4 alpha^2) (k - k0) - (1 + 2 alpha) alpha^2 k0] <= 4 m:
 
-    for every h while it softens. Once stiffened beyond the first bound (1.4 times for alpha = -0.3, 5.5 for -0.05) it
-    is excited at every h, however small, by a rate of O(h^3). With alpha = 0 the second is h^2 (k - k0) <= 4 m: q~ then
-    takes the steps of velocity Verlet with the mass M + h^2 K0/4.
+    for every h while it softens. Once it has stiffened beyond the first bound (1.4 times for alpha = -0.3, 5.5 for
+    -0.05) its amplitude grows for every h, however small, at a rate O(h^3). With alpha = 0 the second bound is h^2 (k -
+    k0) <= 4 m: q~ then takes the steps of velocity Verlet with the mass M + h^2 K0/4.
 
-    Runs begin as those of `hht` do, not with a = M^-1 Q as in the sources.
+    Runs start as those of `hht` do, not with a = M^-1 Q as in the sources.
 
-    `solution.acceleration` holds a, which belongs to the time t + alpha h.
+    `solution.acceleration` holds a, which is the acceleration at the time t + alpha h.
 
     Args:
         alpha: in [-1/3, 0].
-        modified: True for the form with numerical damping of the stiffness force alone.
+        modified: True for the form in which numerical damping acts on the stiffness force only.
 
     Returns:
         A `Stepper`.

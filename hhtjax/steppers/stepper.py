@@ -1,4 +1,4 @@
-"""What every stepper shares: the state it carries, what it reports, and how it is called."""
+"""The common parts of all steppers: the state, the report of a step, and the interface of a method."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from hhtjax.systems.system import require_system as require_system
 
 @shown
 class State(NamedTuple):
-    """What the next step needs.
+    """The data that the next step needs.
 
     Attributes:
         t: time.
-        q, v: position and velocity. Of a first-order system y and y'.
-        w: acceleration, w = M^-1 Q on the trajectory; None of a first-order system.
-        a: algorithmic acceleration of the generalised-alpha recursion (algorithmic y' of a first-order system), None
-            where a method has none.
-        z, zdot, za: internal states, their rates and their algorithmic rates, None without.
-        L: multipliers (m,) of constraints, None without.
-        friction: `FrictionState`, the directions of sliding and the forces of dry friction, None without.
-        contact: `ContactState`, None without.
-        memory: whatever else a method carries on, on vectors; None where there is nothing.
+        q, v: position and velocity; for a first-order system y and y'.
+        w: acceleration, equal to M^-1 Q along the motion; None for a first-order system.
+        a: algorithmic acceleration of the generalised-alpha recursion (algorithmic y' for a first-order system); None
+            if the method has none.
+        z, zdot, za: internal states, their rates and their algorithmic rates; None without internal states.
+        L: multipliers (m,) of constraints; None without constraints.
+        friction: `FrictionState`, the sliding directions and the forces of dry friction; None without dry friction.
+        contact: `ContactState`; None without contacts.
+        memory: other data that a method carries, on vectors; None if there are none.
     """
 
     t: Array
@@ -56,16 +56,16 @@ class State(NamedTuple):
 
 @shown
 class ContactState(NamedTuple):
-    """What a step remembers of contacts.
+    """The data of contacts that the next step needs.
 
     Attributes:
-        f: (2 m,), the forces: normal ones, positive where they push, then those along the surfaces.
+        f: (2 m,), the forces: first the normal forces, positive where they push, then the forces along the surfaces.
         closed: (m,), 1 where bodies touch, else 0.
         sig: (m,), the direction in which a closed contact slides: -1, 1, or 0 where it sticks.
-        sticks: (m,), 1 where it is held by friction, else 0.
-        since: (m,), since when a closed contact is that, -inf from the start on.
-        impacts: (m,), how often bodies have met there.
-        code: 0, or what went wrong where the modes were chosen, for the next step to tell.
+        sticks: (m,), 1 where friction holds it, else 0.
+        since: (m,), the time since which a closed contact has been closed, -inf if since the start.
+        impacts: (m,), the number of impacts so far.
+        code: 0, or what went wrong when the modes were chosen, which the next step reports.
     """
 
     f: Array
@@ -77,17 +77,18 @@ class ContactState(NamedTuple):
     code: Array
 
     def following(self, before: ContactState, t: Array) -> ContactState:
-        """This one, of a new start at t, with what is known before it: impacts, and since when contacts are closed."""
+        """The state for a new start at t, with the history from before: impacts, and since when contacts have been
+        closed."""
         return self._replace(since=jnp.where(before.closed > 0, before.since, t), impacts=before.impacts)
 
 
 @shown
 class FrictionState(NamedTuple):
-    """What a step remembers of dry friction.
+    """The data of dry friction that the next step needs.
 
     Attributes:
         sig: (m,), the direction in which each joint slides: -1, 1, or 0 where it sticks.
-        tau: (m,), the friction, positive against positive sliding.
+        tau: (m,), the friction, positive for positive sliding.
     """
 
     sig: Array
@@ -99,25 +100,25 @@ INTERNAL = {"v": "z", "w": "zdot", "a": "za"}  # where a state has what is no ra
 
 @shown
 class Info(NamedTuple):
-    """What a step tells about itself; None where a method has nothing to tell.
+    """The report of a step. A field is None if the method does not report it.
 
     Attributes:
         residual: max-norm of M w - Q at the accepted iterate, in units of force.
         iterations: number of Newton iterations.
-        converged: whether they met the tolerance.
+        converged: whether they reached the tolerance.
         constraint: max-norm of Phi at the end of the step.
-        constraint_rate: that of dPhi/dt.
-        dependent_row: index of the first row of the constraint that depends on those before it at the start of the
+        constraint_rate: max-norm of dPhi/dt at the end of the step.
+        dependent_row: index of the first row of the constraint that depends on the rows before it at the start of the
             step; -1 while B has full rank.
-        solve_residual: what the linear solve left of its right-hand side, relative to it, where the solve is taken on
-            trust (`banded`, `conjugate_gradients`, a given function), or made with a sparse matrix.
-        solved: whether that is within its tolerance.
-        friction: the part of a step that is left where several joints switch more often than it resolves; infinite
-            where a limit is negative or not finite, and 2 where directions of friction came to depend on each other.
-        defect: S^-1 r, what a linearised step has left of its residual at its end, as a correction of the unknowns
-            (under error control only).
+        solve_residual: the relative residual of the linear solve, if the solve may be inexact (`banded`,
+            `conjugate_gradients`, a given function), or uses a sparse matrix.
+        solved: whether that residual is within its tolerance.
+        friction: the fraction of a step that is left if joints switch more often than the step can follow; infinite if
+            a limit is negative or not finite, and 2 if directions of friction came to depend on each other.
+        defect: S^-1 r, the residual that a linearised step leaves at its end, as a correction of the unknowns (only
+            under error control).
         contact: 0, or the code of what went wrong with contacts.
-        switched: by how much dry friction that switched has changed the accelerations (alike).
+        switched: the change of the accelerations by dry friction that switched (only under error control).
     """
 
     residual: Array | None = None
@@ -134,7 +135,7 @@ class Info(NamedTuple):
     switched: Array | None = None
 
     def _verdict(self):
-        """Of several steps."""
+        """The joined `Info` of several steps."""
         met = known(self.converged)
         if met is None or not met.ndim:
             return ""
@@ -142,7 +143,7 @@ class Info(NamedTuple):
 
 
 def join_info(info: Info, new: Info) -> Info:
-    """Info of several steps as one: largest residuals, number of iterations, all converged."""
+    """The `Info` of several steps as one: largest residuals, number of iterations, whether all converged."""
     join = {
         "iterations": jnp.add,
         "converged": jnp.logical_and,
@@ -155,9 +156,9 @@ def join_info(info: Info, new: Info) -> Info:
 
 
 class Stepper(Description):
-    """Base of all steppers. A family implements `order`, `begin` and `bind`, on vectors.
+    """Base class of all steppers. A method implements `order`, `begin` and `bind`, on vectors.
 
-    `init` and `step` wrap them for pytrees, for those who write their own loop:
+    `init` and `step` wrap them for pytrees. Use them to write your own loop:
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(mass=jnp.array([1.0]), force=lambda q, v, t, params: {"x": -4.0 * q["x"]})
@@ -189,7 +190,7 @@ class Stepper(Description):
 
     @property
     def name(self) -> str:
-        """Of the method, as messages give it."""
+        """The name of the method in messages."""
         return type(self).__name__
 
     def for_tolerance(self, rtol: Real) -> Stepper:
@@ -210,39 +211,40 @@ class Stepper(Description):
         resolves: bool = False,
         alone: bool = False,
     ) -> State:
-        """The state from which the first step goes, where that is another than the one at the initial time.
+        """The state from which the first step starts, if it differs from the one at the initial time.
 
-        moves: whether its velocity may be another, too. resolves: whether the first step, by error control, is so short
-        that it follows what is fastest. alone: whether no kernel is around."""
+        moves: whether its velocity may differ, too. resolves: whether the first step, chosen by error control, is so
+        short that it resolves the fastest motion. alone: whether no kernel surrounds it."""
         return state
 
     def jumped(
         self, system: FlatSystem, before: State, after: State, old: PyTree, new: PyTree, dt: Array, answer: Callable
     ) -> State:
-        """`after`, the state where held inputs jump, with M dw = Q(new) - Q(old), or what else a step dt asks for;
-        `before`: the same without. answer: dQ -> dw."""
+        """`after`, the state where held inputs jump, with M dw = Q(new) - Q(old), or with what a step dt needs in
+        addition; `before`: the state before the jump. answer: dQ -> dw."""
         return after
 
     def throws(self, system: FlatSystem) -> bool:
-        """Whether it leaves in q what does not fit a step, such as one far longer than those before."""
+        """Whether a step far longer than those before leaves in q what does not fit that step, so that `grown` is
+        needed."""
         return False
 
     def grown(self, system: FlatSystem, state, params: PyTree, dt: Array):
-        """The state from which such a step goes, where `throws` says so: of the method and the state for dt."""
+        """The state from which such a step starts, if `throws`: for the method and the state for dt."""
         raise NotImplementedError
 
     def factors_of(self, system: FlatSystem, dt: Array) -> Any:
-        """What is factorised once for many runs of a linear system of constant matrices, as `FlatSystem.factors`."""
+        """The factors for many runs of a linear system with constant matrices, as `FlatSystem.factors`."""
         return None
 
     def bind(self, system: FlatSystem, params: PyTree, dt: Array):
-        """The function State -> (State, Info) of a `FlatSystem`, with all that is constant done once."""
+        """The function State -> (State, Info) for a `FlatSystem`, with everything constant computed once."""
         raise NotImplementedError
 
     def resized(self, state: State, r: Array):
-        """The stepper and the state for a step r times as long as the one before: by default the same.
+        """The stepper and the state for a step r times as long as the previous one; by default unchanged.
 
-        For those who write their own loop, before a step of another size:
+        Call it in your own loop before a step of another size:
 
         >>> import jax.numpy as jnp, hhtjax
         >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -q)
@@ -254,7 +256,7 @@ class Stepper(Description):
         return self, state
 
     def astype(self, dtype: np.dtype):
-        """The same with its arrays, such as a traced alpha, in the dtype of the state."""
+        """The stepper with its arrays, such as a traced alpha, in the dtype of the state."""
         return jax.tree.map(lambda x: jnp.asarray(x).astype(dtype), self)
 
     def init(
@@ -264,7 +266,7 @@ class Stepper(Description):
         return begun("init", system, self, *initial_values("init", system, q0, v0, z0), params, dt, t0)
 
     def step(self, system: AnySystem, state: State, params: PyTree, dt: Real) -> tuple[State, Info]:
-        """State one step dt after `state`, and what the step tells about itself."""
+        """The state one step dt after `state`, and the `Info` of the step."""
         params = freeze(params)
         flat, q, v = flatten("step", system, state.q, state.v, state.t, params, state.z)
         w = ravel_pytree((state.w if flat.positions else state.v, state.zdot))[0]
@@ -286,7 +288,7 @@ def begun(
     dt: Real,
     t0: Real = 0.0,
 ) -> State:
-    """What `Stepper.init` makes of checked initial values."""
+    """The result of `Stepper.init`, for checked initial values."""
     require_capable(caller, system, stepper, q0, v0)
     params = freeze(params)
     flat, q, v = flatten(caller, system, q0, v0, t0, params, z0)
@@ -298,7 +300,7 @@ def begun(
 
 
 def entered(stepper: Stepper, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array, **how: bool):
-    """The state at a start, and that from which the first step dt goes. how: of `Stepper.smoothed`."""
+    """The state at a start, and the state from which the first step dt starts. how: see `Stepper.smoothed`."""
     start = stepper.begin(system, q, v, t, params, dt)
     return start, stepper.smoothed(system, start, params, dt, **how)
 
@@ -306,11 +308,11 @@ def entered(stepper: Stepper, system: FlatSystem, q: Array, v: Array, t: Array, 
 def bound(stepper: Stepper, system: FlatSystem, params: PyTree, dt: Array, last: Array | None = None):
     """The function State -> (State, Info) of `stepper.bind`, with held inputs constant over each step.
 
-    last: the step before, where it is another than dt."""
+    last: the size of the previous step, if it differs from dt."""
     if system.matrices is not None and not stepper.keeps_sparse:
         raise NotImplementedError(
-            f"{stepper.name} cannot keep the matrices of the system sparse; use hht() or another of its "
-            "family, a Rosenbrock method such as rodas5p(), rk4() or dopri5(), or hand over arrays: K.toarray()."
+            f"{stepper.name} does not support sparse matrices; use hht() or another of its "
+            "family, a Rosenbrock method such as rodas5p(), rk4() or dopri5(), or pass arrays: K.toarray()."
         )
     if not zero_order_hold.holds(params):
         return stepper.bind(system, params, dt)
@@ -323,7 +325,7 @@ def bound(stepper: Stepper, system: FlatSystem, params: PyTree, dt: Array, last:
 
 
 def step_start(stepper: Stepper, system: FlatSystem, params: PyTree, dt: Array, last: Array, s: State):
-    """The params of a step dt, and the state that it starts from; last: the step before."""
+    """The params of a step dt, and the state from which it starts; last: the size of the previous step."""
     if not zero_order_hold.holds(params):
         return params, s
     now = zero_order_hold.held_at(params, s.t + dt / 2)
@@ -334,12 +336,13 @@ def step_start(stepper: Stepper, system: FlatSystem, params: PyTree, dt: Array, 
 def behind_jump(
     stepper: Stepper, system: FlatSystem, s: State, old: PyTree, new: PyTree, h: Array, here: Array | None = None
 ) -> State:
-    """The state with the accelerations and multipliers that belong to the new params, for a step h:
+    """The state with the accelerations and multipliers for the new params, for a step h:
 
         M dw - B^T dL = Q(new) - Q(old),   B dw = 0
 
-    What damps far too stiffly for the step changes its velocity, too: see `Stepper.jumped`. here: whether there is a
-    jump at all, as far as that is known; not whether values differ, as derivatives in equal ones are those of a jump.
+    Damping that is far too stiff for the step changes the velocity, too: see `Stepper.jumped`. here: whether there is a
+    jump at all, as far as that is known. It does not depend on the values, because derivatives at equal values are
+    those of a jump.
     """
 
     behind = partial(_behind_jump, stepper, system)
@@ -347,7 +350,7 @@ def behind_jump(
 
 
 def _behind_jump(stepper: Stepper, system: FlatSystem, s: State, old: PyTree, new: PyTree, h: Array) -> State:
-    """The state behind a jump."""
+    """The state after a jump."""
     dQ, L = system.force(s.q, s.v, s.t, new) - system.force(s.q, s.v, s.t, old), s.L
     answer = answers(system, s.q, s.t, new, stepper.redundant)
     dw, dL = answer(dQ)
@@ -362,13 +365,14 @@ def _behind_jump(stepper: Stepper, system: FlatSystem, s: State, old: PyTree, ne
 
 
 def require_stepper(caller: str, stepper: Stepper):
-    """An error for what is no stepper."""
+    """Raises an error for anything but a stepper."""
     if not isinstance(stepper, Stepper):
         raise TypeError(f"{caller}: `stepper` must be a stepper such as hht(); received {stepper!r}.")
 
 
 def require_capable(caller: str, system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree):
-    """An error for a constraint, a rotation, internal states or friction that the stepper does not know."""
+    """Raises an error for constraints, rotations, internal states, contact or friction that the stepper does not
+    support."""
     name = stepper.name
     if not stepper.starts_massless:
         require_masses(caller, system, 'take hht(), or another of its family, with a smooth start, not start="simple"')
@@ -392,9 +396,9 @@ def require_capable(caller: str, system: AnySystem, stepper: Stepper, q0: PyTree
 
 
 def public(flat: FlatSystem, state: State) -> State:
-    """The state as its user sees it, internal states by themselves.
+    """The state in the form that users see, with internal states separate.
 
-    A first-order system has nothing else, and they are its q; their rates are its v, and it has no w.
+    In a first-order system the internal states are its q, and their rates its v; it has no w.
     """
     n = flat.positions
     if n == 0:

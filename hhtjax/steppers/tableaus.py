@@ -1,6 +1,6 @@
-"""Runge-Kutta and Rosenbrock methods as numbers.
+"""Runge-Kutta and Rosenbrock methods as tableaus of coefficients.
 
-The formulas that they enter are at the top of `runge_kutta.py` and of `rosenbrock.py`.
+The formulas that use them are at the top of `runge_kutta.py` and of `rosenbrock.py`.
 """
 
 from __future__ import annotations
@@ -14,16 +14,17 @@ class ExplicitTableau(NamedTuple):
 
     Attributes:
         name: of the method.
-        A: the rows of the stages 2 to s, those entries that are below the diagonal.
-        b: (s,), the end of the step.
-        error: (s + 1,), the weights (*b, 0) of the s stages and of the rate at the end of the step, less those of the
+        A: the rows of the stages 2 to s; only the entries below the diagonal.
+        b: (s,), the weights of the end of the step.
+        error: (s + 1,), the weights (*b, 0) of the s stages and of the rate at the end of the step, minus those of the
             embedded method; many sources print the negative. None without an estimate.
-        embedded_order: of that method.
-        dense: rows of weights: e_k = h sum_j dense_kj k_j, of which dense output adds s^2 (1 - s)^2 sum_k s^k e_k to
-            the cubic Hermite polynomial, s in [0, 1] from the start to the end of the step; None for cubics alone.
-        extra: the rows of more stages, behind the end of the step, which only dense output has.
-        error_of_3: (s,), the weights of the error of another embedded method, of order 3, with which the error becomes
-            e^2 / (e^2 + e_3^2/100)^(1/2), of order `embedded_order` + 1 though e is of a lower one.
+        embedded_order: the order of the embedded method.
+        dense: rows of weights of the dense output. With e_k = h sum_j dense_kj k_j, it adds s^2 (1 - s)^2 sum_k s^k e_k
+            to the cubic Hermite polynomial, s in [0, 1] from the start to the end of the step. None for the cubic
+            alone.
+        extra: the rows of additional stages, after the end of the step, for dense output only.
+        error_of_3: (s,), the weights of the error of another embedded method, of order 3. The error then becomes e^2 /
+            (e^2 + e_3^2/100)^(1/2), of order `embedded_order` + 1 although e is of a lower order.
     """
 
     name: str
@@ -37,21 +38,22 @@ class ExplicitTableau(NamedTuple):
 
 
 def filled(rows: Sequence, size: int) -> list:
-    """Rows of so many numbers: what is missing is 0."""
+    """Rows padded with zeros to the given length."""
     return [[*row, *(size - len(row)) * (0.0,)] for row in rows]
 
 
 class RosenbrockTableau(NamedTuple):
-    """A Rosenbrock method of s stages, in the notation at the top of this file.
+    """A Rosenbrock method of s stages, in the notation at the top of `rosenbrock.py`.
 
     Attributes:
         name: of the method.
         g: the diagonal of the matrix G.
-        A, G: s rows each, those entries that are below the diagonal; missing ones are 0.
-        b: (s,), the end of the step.
-        embedded: (s,), the end by a method of the next lower order.
-        dense: rows (s,) of weights: e_k = h sum_j dense_kj k_j, of which dense output adds s^2 (1 - s)^2 sum_k s^k e_k
-            to the cubic Hermite polynomial, s in [0, 1] from the start to the end of the step; None for cubics alone.
+        A, G: s rows each; only the entries below the diagonal; missing ones are 0.
+        b: (s,), the weights of the end of the step.
+        embedded: (s,), the weights of the end of the step by a method of the next lower order.
+        dense: rows (s,) of weights of the dense output. With e_k = h sum_j dense_kj k_j, it adds s^2 (1 - s)^2 sum_k
+            s^k e_k to the cubic Hermite polynomial, s in [0, 1] from the start to the end of the step. None for the
+            cubic alone.
     """
 
     name: str

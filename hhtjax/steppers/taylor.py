@@ -1,12 +1,12 @@
-"""Taylor series: explicit steps of any order, with the coefficients of the motion by recurrences.
+"""Taylor series: explicit steps of any order, whose coefficients follow from recurrences.
 
 With v' = w = M^-1 Q(q, v, t) as a program of few kinds of operations on power series (`numerics/series_program.py`),
 the coefficients of y(t + s) = sum_k y_k s^k follow one after the other from the state,
 
     w_k from q_0 .. q_k and v_0 .. v_k,    v_{k+1} = w_k / (k + 1),    q_{k+1} = v_k / (k + 1)
 
-and a step is the sum of its series. No other function is differentiated, and nothing is solved but M. The series is
-that of the whole step: what happens within it is read off for nothing.
+and a step is the sum of its series. Nothing is differentiated, and only M is solved for. The series is valid in the
+whole step, so values within the step cost nothing.
 
 A. Jorba, M. Zou, Experimental Mathematics 14 (2005) 99-117.
 """
@@ -61,33 +61,33 @@ class Taylor(Stepper):
 
     @property
     def name(self) -> str:
-        """Of the method."""
+        """The name of the method."""
         return "taylor"
 
     @property
     def estimate_order(self):
-        """That of the method."""
+        """The order of the method."""
         return 1 if self.order is None else self.order
 
     def for_tolerance(self, rtol: Real) -> Taylor:
-        """The same with the order that is best for a tolerance, where none was given."""
+        """The method with the best order for a tolerance, unless an order was given."""
         if self.order is not None:
             return self
         if not is_concrete(rtol):
             raise ValueError(
-                "taylor: give `order`, such as taylor(order=12), where the tolerance is traced: it follows from "
-                "`rtol`, and is part of the program."
+                "taylor: give `order`, such as taylor(order=12), if the tolerance is traced: the default order "
+                "follows from `rtol`, and is part of the program."
             )
         return replace(self, order=order_for(float(np.min(rtol))))
 
     def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
-        """The state with w = M^-1 Q, and room for the series of a step."""
+        """The state with w = M^-1 Q, and space for the series of a step."""
         order = self._number()
         none = Expansion(jnp.zeros((order + 1, system.size), v.dtype))
         return State(t, q, v, series_of(order, system, q, v, t, params).rates(), memory=none)
 
     def bind(self, system: FlatSystem, params: PyTree, dt: Array):
-        """The sum of the series, which the end of the step keeps in memory."""
+        """The sum of the series; the state at the end of the step keeps the series."""
 
         def step(s: State):
             return self.moved(system, s, params, self.expansion(system, s, params), dt), Info()
@@ -95,7 +95,7 @@ class Taylor(Stepper):
         return step
 
     def expansion(self, system: FlatSystem, s: State, params: PyTree) -> Expansion:
-        """The series from a state on."""
+        """The series about a state."""
         return series_of(self._number(), system, s.q, s.v, s.t, params).expansion()
 
     def moved(self, system: FlatSystem, s: State, params: PyTree, series: Expansion, dt: Array) -> State:
@@ -105,13 +105,14 @@ class Taylor(Stepper):
         return State(t, q, v, series_of(self._number(), system, q, v, t, params).rates(), memory=series)
 
     def begin_estimates(self, system: FlatSystem, state: State):
-        """Nothing is remembered."""
+        """Empty: estimates need no memory."""
         return ()
 
     def bind_estimated(self, system: FlatSystem, params: PyTree, dt: Array, past: tuple):
-        """State -> State, Info, Errors, (): from what the rate of the series is off by at the end of the step.
+        """State -> State, Info, Errors, (). The error is estimated from the defect of the series in the equation of
+        motion at the end of the step.
 
-        past: the series, where it is known."""
+        past: the series, if it is known."""
         k = self._number() + 1
 
         def estimated(s: State):
@@ -123,11 +124,11 @@ class Taylor(Stepper):
         return estimated
 
     def proposed(self, system: FlatSystem, s: State, params: PyTree, rtol: Array, q_size: Array, v_size: Array):
-        """The series from a state on, and the step by its radius of convergence R, as of Jorba and Zou:
+        """The series about a state, and the step from its radius of convergence R, after Jorba and Zou:
 
             h = R (SHARE rtol)^(1/p),    R = min_k (size / |v_k|)^(1/k)
 
-        over the last k. sizes: (n,) and (N,), of which coefficients are parts."""
+        over the last k. sizes: (n,) and (N,), with which coefficients are compared."""
         series = self.expansion(system, s, params)
         p, V = self._number(), series.coefficients
         last = range(max(p - LAST, 0) + 1, p + 1)
@@ -144,7 +145,7 @@ class Taylor(Stepper):
         if self.order is None:
             raise ValueError(
                 "taylor: give `order`, such as taylor(order=12), or a tolerance, `dt=adaptive(rtol, atol)`, from which "
-                "it follows."
+                "the order follows."
             )
         return self.order
 
@@ -160,7 +161,7 @@ def summed(series: Expansion, h: Array):
 
 
 def order_for(rtol: float) -> int:
-    """The order of least work for a tolerance, of Jorba and Zou: 1 - ln(rtol) / 2."""
+    """The order with the least work for a tolerance, after Jorba and Zou: 1 - ln(rtol) / 2."""
     return min(max(math.ceil(1 - math.log(rtol) / 2), 2), HIGHEST)
 
 
@@ -172,7 +173,7 @@ PROGRAMS: WeakKeyDictionary = WeakKeyDictionary()  # {force of a system: {what e
 
 
 class Known(NamedTuple):
-    """Functions of numbers for all places of a program, the series and the rates alone, and what else they take."""
+    """The functions of a program on numbers (the series, and the rates alone), and the values they take in addition."""
 
     series: Callable
     first: Callable
@@ -208,7 +209,8 @@ def series_of(order: int, system: FlatSystem, q: Array, v: Array, t: Array, para
 
 
 def _functions(program: SeriesProgram, positions: int, order: int, dtype: np.dtype):
-    """The series and the rates, of numbers; they hold nothing of the system, which `PROGRAMS` would keep alive."""
+    """The functions for the series and the rates, on numbers. They do not refer to the system, which `PROGRAMS` would
+    keep alive."""
 
     def series(*arrays: Array) -> Array:
         return coefficients(program, positions, _scalars(arrays), order, dtype)
@@ -220,7 +222,7 @@ def _functions(program: SeriesProgram, positions: int, order: int, dtype: np.dty
 
 
 def _known(system: FlatSystem, q: Array, v: Array, t: Array, leaves: list, structure: Any):
-    """The accelerations, traced and written as a program on series, and what their functions close over."""
+    """The accelerations, traced and written as a program on series, and the values that their functions close over."""
 
     def acceleration(q: Array, v: Array, t: Array, *leaves: Array) -> Array:
         return system.acceleration(q, v, t, structure.unflatten(leaves))
@@ -256,27 +258,27 @@ def taylor(order: int | None = None) -> Taylor:
 
         q(t + h) = sum_k q_k h^k,    v(t + h) = sum_k v_k h^k,    k = 0 .. order
 
-    The coefficients come from recurrences over `mass` and `force` as they are traced, at a cost of order^2 and no
-    derivative. Under error control, `simulate(..., dt=adaptive(rtol, atol))`, the order is by default
-    1 - ln(rtol)/2, 11 for 1e-8, and steps are parts of the radius of convergence: a step is known before it is taken,
-    and hardly ever rejected. Samples within steps have the accuracy of their ends. Explicit, as `dopri5`, and no better
-    than that where something is stiff.
+    The coefficients follow from recurrences over the traced `mass` and `force`, at a cost of order^2 and without
+    derivatives. With error control, `simulate(..., dt=adaptive(rtol, atol))`, the default order is 1 - ln(rtol)/2, 11
+    for 1e-8, and a step is a fraction of the radius of convergence: its size is known in advance, and steps are hardly
+    ever rejected. Samples within steps are as accurate as the ends of steps. The method is explicit like `dopri5`, and
+    no better where something is stiff.
 
-    Of the functions of a system it takes sums, products, quotients, powers, roots, exponentials, logarithms,
-    trigonometric and hyperbolic functions, their inverses and the error function, and linear solves; what has no Taylor
-    series, such as `abs`, `where` with a moving condition, tables of `sampled` or a `while_loop`, is refused.
-    Derivatives are those of the steps. A function with derivatives of its own (`jax.custom_jvp`), and
-    `lax.stop_gradient`, in `mass` or `force` are differentiated as what they compute.
+    The functions of a system may use sums, products, quotients, powers, roots, exponentials, logarithms, trigonometric
+    and hyperbolic functions, their inverses, the error function, and linear solves. Operations without a Taylor series
+    raise an error: `abs`, `where` with a condition that changes, tables of `sampled`, a `while_loop`. Derivatives are
+    those of the steps. Custom derivative rules (`jax.custom_jvp`, `lax.stop_gradient`) in `mass` or `force` are
+    ignored: what they compute is differentiated.
 
     Args:
-        order: 2 or more; None: from the tolerance.
+        order: from 2 to 40; None: from the tolerance.
 
     Returns:
         A stepper.
 
     Raises:
-        TypeError, ValueError: an order that is no integer, or below 2 or above 40.
-        NotImplementedError: in the first call, an operation without a Taylor series, by its name and line.
+        TypeError, ValueError: an order that is not an integer, or below 2 or above 40.
+        NotImplementedError: in the first call, for an operation without a Taylor series; it is named with its line.
 
     References:
         Jorba, Zou, Experimental Mathematics 14, 2005, 99-117.

@@ -1,25 +1,26 @@
-"""Steps of unequal size that keep order 2: the generalised-alpha family after a change of the step.
+"""Steps of unequal size with order 2: the generalised-alpha family after a change of the step size.
 
-The algorithmic acceleration a_n belongs to the time t_n + s h_old, s = alpha_m - alpha_f and h_old the step before. A
-step h = r h_old expects it at t_n + s h, and has an error of O(h) in a, of order 1 in the end. Two rules mend that,
-without a solve; both leave r = 1 as it is:
+The algorithmic acceleration a_n is the acceleration at the time t_n + s h_old, where s = alpha_m - alpha_f and h_old is
+the previous step. A step h = r h_old assumes that it is the one at t_n + s h. This is an error of O(h) in a, and gives
+order 1 in the end. Two rules correct it without a solve; both do nothing for r = 1:
 
     r <= 1    a is moved:  a := w + r (a - w)
-    r > 1     a stays, and the coefficients of this step know where it is, with sigma = s/r:
+    r > 1     a stays, and the coefficients of this step account for its time, with sigma = s/r:
               gamma = (1/2 - sigma)/(1 + s - sigma),  beta = (gamma + 1/2)^2/4,
               alpha_f := alpha_f + alpha_m (s - sigma)
 
-The first alone makes steps that grow and shrink in turn unstable; the second alone loses half an order with index 3.
-Where r = 1 the rules meet: a derivative in the step sizes is there that of one side, off by O(h^3).
-For s = 0 (Newmark, the trapezoidal rule) there is nothing to mend. Steps that grow by more than 2 at once can make
-strongly damping methods (rho near 0) unstable. In index-3 form multipliers are of order 1.4 only where steps change;
-in GGL form, the default, of order 2.
+The first rule alone makes alternately growing and shrinking steps unstable. The second alone loses half an order with
+index 3. At r = 1, where the rules meet, a derivative in the step sizes is one-sided, with an error of O(h^3). For s = 0
+(Newmark, the trapezoidal rule) no correction is needed. Steps that grow by more than 2 at once can make strongly
+damping methods (rho near 0) unstable. If steps change, multipliers have only order 1.4 in index-3 form; in GGL form,
+the default, they have order 2.
 
 Without damping (alpha = 0, rho_inf = 1) constraints leave w and the multipliers one weakly stable mode: a step from
-known v has w1 = -w + 2 (v1 - v)/h, errors e1 = -e - h^2 w''/6. Equal steps keep e near -h^2 w''/12; each change of
-h^2 adds to what alternates, for ever. Of random steps that is a random walk: with 80 % of jitter (a pendulum in GGL
-form, 100 to 6400 steps) w is of order 1.47 and L of 1.43; q and v are of order 2.03, as are the means of w and L over
-both ends of a step (2.01, 2.02). With alpha = -0.05 w and L are of order 1.98 and 1.97: damp, where they matter.
+known v has w1 = -w + 2 (v1 - v)/h, with errors e1 = -e - h^2 w''/6. Equal steps keep e near -h^2 w''/12. Each change of
+h^2 adds to the alternating part, which does not decay. For random steps this is a random walk: with 80 % of jitter (a
+pendulum in GGL form, 100 to 6400 steps) w has order 1.47 and L 1.43; q and v have order 2.03, as have the means of w
+and L over both ends of a step (2.01, 2.02). With alpha = -0.05 w and L have orders 1.98 and 1.97: use damping if they
+matter.
 """
 
 from __future__ import annotations
@@ -45,25 +46,25 @@ GROWTH = 2.05  # of a step, up to which the recursion follows
 
 
 class Resizing:
-    """What the family does when the step changes: the two rules above."""
+    """The behaviour of the family when the step size changes: the two rules above."""
 
     coefficients: Coefficients
 
     @property
     def resizes(self) -> bool:
-        """Whether there is anything to mend, alpha_m != alpha_f; a tracer may be."""
+        """Whether a correction is needed, alpha_m != alpha_f; True for a tracer."""
         shift = self.coefficients.alpha_m - self.coefficients.alpha_f
         return not (is_concrete(shift) and shift == 0)
 
     def resized(self, state: State, r: Array):
-        """The method and the state for a step r times as long as the one before."""
+        """The method and the state for a step r times as long as the previous one."""
         if not self.resizes:
             return self, state
         return replace(self, coefficients=adapted(self.coefficients, r)), moved(state, r)  # pyright: ignore[reportArgumentType]
 
 
 def moved(state: State, r: Array) -> State:
-    """The state with a where steps r times as long expect it, for r <= 1; of vectors or of pytrees."""
+    """The state with a moved to where a step r times as long expects it, for r <= 1; for vectors or pytrees."""
     shrunk = jnp.minimum(r, 1) - 1
 
     def move(a: Array, w: Array) -> Array:
@@ -75,7 +76,7 @@ def moved(state: State, r: Array) -> State:
 
 
 def adapted(c: Coefficients, r: Array) -> Coefficients:
-    """The coefficients of a step r times as long as the one before, for r > 1."""
+    """The coefficients of a step r times as long as the previous one, for r > 1."""
     s = c.alpha_m - c.alpha_f
     grown = jnp.maximum(r, 1)
     gamma = (grown / 2 - s) / (grown * (1 + s) - s)  # not through sigma, a division to wait for
@@ -92,7 +93,7 @@ def drifted(flat: FlatSystem, s: State, h: Array) -> State:
 
 
 def resized_step(flat: FlatSystem, stepper: Stepper, params: PyTree, dt: Array, last: Array, grows: bool = False):
-    """State -> (State, Info) for a step dt after one of another size; grows: whether it may be far longer."""
+    """State -> (State, Info) for a step dt after a step of another size; grows: whether dt may be far longer."""
 
     def step(state: State):
         resized, state = stepper.resized(state, dt / last)
@@ -132,23 +133,25 @@ def resized_step(flat: FlatSystem, stepper: Stepper, params: PyTree, dt: Array, 
 
 
 class Errors(NamedTuple):
-    """Of a step, (N,): of the displacement, whose entries beyond the positions mean nothing, and of the rates."""
+    """The errors of a step, (N,): of the displacement (entries without positions have no meaning), and of the rates."""
 
     q: PyTree
     v: PyTree
 
 
 class DenseTerm(NamedTuple):
-    """What dense output adds to cubics: s^2 (1 - s)^2 sum_k s^k e_k, s in [0, 1] from the start to the end of a step.
+    """The correction of dense output to cubics: s^2 (1 - s)^2 sum_k s^k e_k, s in [0, 1] from the start to the end of a
+    step.
 
-    q, v: e_k of the positions, (terms, n), and of the rates, (terms, N). In `State.memory`, of the step before."""
+    q, v: e_k of the positions, (terms, n), and of the rates, (terms, N). Kept in `State.memory`, for the previous
+    step."""
 
     q: Array
     v: Array
 
 
 class Past(NamedTuple):
-    """What the estimate of the family remembers of the step before: (w1 - w)/h, and h, which is 0 before the first."""
+    """What the error estimate keeps of the previous step: (w1 - w)/h, and h, which is 0 before the first step."""
 
     slope: Any
     h: Array
@@ -167,7 +170,7 @@ class Controlled(Resizing):
         return 3 if self.order == 2 else None
 
     def begin_estimates(self, system: FlatSystem, state: State) -> Past:
-        """No step before."""
+        """The memory before the first step."""
         return Past(jnp.zeros_like(state.w), jnp.zeros_like(state.t))
 
     def bind_estimated(self, system: FlatSystem, params: PyTree, dt: Array, past: Past):
@@ -186,7 +189,7 @@ class Controlled(Resizing):
 
 
 def family_errors(c: Coefficients, h: Array, w: Array, w1: Array, past: Past, d: Array | None):
-    """The errors of a step from the accelerations w to w1, and what is to be remembered; d: S^-1 r, or None."""
+    """The errors of a step with accelerations from w to w1, and the memory for the next step; d: S^-1 r, or None."""
     s = c.alpha_m - c.alpha_f
     rate = 1 / h
     slope = (w1 - w) * rate
@@ -200,10 +203,10 @@ def family_errors(c: Coefficients, h: Array, w: Array, w1: Array, past: Past, d:
 
 
 class Embedded:
-    """A method of several stages; its estimate is the difference from one of lower order."""
+    """A method of several stages whose error estimate is the difference from an embedded method of lower order."""
 
     def begin_estimates(self, system: FlatSystem, state: State):
-        """Nothing is remembered."""
+        """Empty: estimates need no memory."""
         return ()
 
     def bind(self, system: FlatSystem, params: PyTree, dt: Array):
@@ -231,7 +234,7 @@ class Embedded:
 
 
 class Tabulated(Embedded):
-    """The same, given by its tableau."""
+    """An embedded method that is given by its tableau."""
 
     tableau: Any  # with `dense`, rows of weights, or None for cubics alone
     order: int
@@ -241,12 +244,12 @@ class Tabulated(Embedded):
 
     @property
     def name(self) -> str:
-        """Of the method."""
+        """The name of the method."""
         return self.tableau.name
 
     @property
     def dense_term(self) -> bool:
-        """Whether dense output is more than cubics."""
+        """Whether dense output has terms beyond cubics."""
         return self.tableau.dense is not None
 
     def begin(self, system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree, dt: Array) -> State:
@@ -258,7 +261,8 @@ class Tabulated(Embedded):
         return State(t, q, v, system.acceleration(q, v, t, params), memory=memory)
 
     def dense_terms(self, s: State, increment: Callable) -> DenseTerm | None:
-        """What dense output of a step from s adds to cubics. increment: weights -> what q and the rates gain."""
+        """The correction of the dense output of a step from s to cubics. increment: weights -> changes of q and of the
+        rates."""
         if not self.dense_term:
             return None
         e = jnp.stack([increment(row) for row in self.tableau.dense])

@@ -2,11 +2,11 @@
 
     M(q) w = Q(q, v, t) + B^T L,    Phi(q, t) = 0,    B = dPhi/dq
 
-A system is two functions of position q, velocity v, time and parameters, or three with a constraint: M is the mass
-matrix, Q the force, w the acceleration; Phi are the constraints, and the multipliers L the forces that hold them. q and
-v are any pytrees, that is, nested dicts, lists and tuples of arrays, of one structure; the rows of M follow
-`jax.flatten_util.ravel_pytree(v)`, which takes the keys of a dict in sorted order. Whatever may change belongs into
-params: it can then be fitted, differentiated, and run in batches.
+A system is given by functions of position q, velocity v, time and parameters: M is the mass matrix, Q the force, and
+Phi, if there are any, the constraints. w is the acceleration, and the multipliers L are the constraint forces. q and v
+are any pytrees (nested dicts, lists and tuples of arrays) of the same structure. The rows of M follow
+`jax.flatten_util.ravel_pytree(v)`, which takes the keys of a dict in sorted order. Put whatever may change into params:
+it can then be fitted, differentiated, and run in batches.
 
 >>> import jax, jax.numpy as jnp, hhtjax
 >>> def mass(q, params):                  # (n, n), or (n,) for a diagonal; or an array in place of the function
@@ -21,29 +21,30 @@ params: it can then be fitted, differentiated, and run in batches.
 >>> run.t.shape, run.q.shape, run.acceleration.shape
 ((501,), (501, 1), (501, 1))
 
-Functions are known by their identity: a system that reads a global variable keeps the value that it had at the first
-call. `hhtjax.runs` says more about it, and the way round.
+A system whose functions read a global variable is compiled anew when that variable has changed. `hhtjax.runs` says more
+about it, and how to avoid it.
 
 Energies
 --------
 
-Energies are enough: `System.from_lagrangian` makes M and Q of L = T - V by automatic differentiation. A linear system,
-`LinearSystem`, is factorised once for a whole run. A first-order system y' = f(y, t) is a `FirstOrderSystem`.
+If you know the energies, `System.from_lagrangian` derives M and Q from L = T - V by automatic differentiation. For a
+linear system use `LinearSystem`, which is factorised once for a whole run. For a first-order system y' = f(y, t) use
+`FirstOrderSystem`.
 
 >>> spring = hhtjax.System.from_lagrangian(
 ...     lagrangian=lambda q, v, t, p: 0.5 * jnp.sum(v**2) - 0.5 * p["k"] * jnp.sum(q**2),
 ...     force=lambda q, v, t, p: p["u"](t) - 0.1 * v)
 
-M may change in time, as that of a load which is hoisted, or of a pendulum whose length is driven: L may depend on t as
-it likes, and `System` takes a function `mass(q, t, params)`. All steppers keep their order on it.
+M may change in time, as for a load that is hoisted, or a pendulum whose length is driven. L may depend on t in any way,
+and `System` takes a function `mass(q, t, params)`. All steppers keep their order.
 
 Linear systems, and others with few nonlinear forces
 ----------------------------------------------------
 
-`LinearSystem(M, C, K, force)` is factorised once for the whole run, also with a nonlinear force at a few coordinates
-beside it, an end stop, a joint, a damper, or with dry friction. Matrices may be SciPy's sparse ones, as
-`scipy.io.mmread` reads them, and large ones stay sparse (`hhtjax.sparse`); `hhtjax.analysis.modal_reduction` reduces
-large ones to their lowest modes, and knows their frequencies.
+`LinearSystem(M, C, K, force)` is factorised once for the whole run. It may also have a nonlinear force at a few
+coordinates (an end stop, a joint, a damper), or dry friction. Matrices may be SciPy's sparse ones, for example from
+`scipy.io.mmread`; large ones stay sparse (`hhtjax.sparse`). `hhtjax.analysis.modal_reduction` reduces large systems to
+their lowest modes, and returns the frequencies.
 
 >>> n = 100
 >>> K = 1e4 * (2 * jnp.eye(n) - jnp.eye(n, k=1) - jnp.eye(n, k=-1))
@@ -58,17 +59,17 @@ large ones to their lowest modes, and knows their frequencies.
 Other packages
 --------------
 
-`hhtjax.interop.diffrax_term` is a system as a diffrax term, with (q, v), or (q, v, z), for its state, and
-`hhtjax.interop.scipy_rhs` what SciPy's `solve_ivp` takes, Jacobian included; constraints are reduced to index 1. params
-may hold modules of equinox, a force that is a neural network among them: `simulate`, `sweep` and `fit` take them as
-they are, and `equinox.filter_grad` gives derivatives.
+`hhtjax.interop.diffrax_term` turns a system into a diffrax term with the state (q, v), or (q, v, z).
+`hhtjax.interop.scipy_rhs` returns the arguments of SciPy's `solve_ivp`, Jacobian included. Both reduce constraints to
+index 1. params may contain modules of equinox, such as a force that is a neural network: `simulate`, `sweep` and `fit`
+accept them, and `equinox.filter_grad` gives derivatives.
 
 Inputs
 ------
 
-A measured input is data: `sampled` makes a function of time of it, to be put into params, of samples at equal steps or
-at any `times`. `band_limited` does so for
-samples hardly denser than their highest frequency, and `spline_gain_error` tells when that is needed.
+`sampled` turns a measured input, with samples at equal steps or at any `times`, into a function of time; put it into
+params. Use `band_limited` for samples that are hardly denser than their highest frequency; `spline_gain_error` tells
+whether you need it.
 
 >>> u = hhtjax.sampled(jnp.sin(jnp.linspace(0.0, 6.0, 61)), dt=0.1)                # a cubic spline through the samples
 >>> run = hhtjax.simulate(spring, hhtjax.hht(), q0, v0, {"k": 9.0, "u": u}, dt=1e-2, num_steps=600)
@@ -77,11 +78,11 @@ samples hardly denser than their highest frequency, and `spline_gain_error` tell
 Constraints
 -----------
 
-`System(mass, force, constraint)` with `constraint(q, t, params) -> (m,)` is a mechanism in more coordinates than it has
-freedoms. The `hht` family solves it, by default with one linear solve per step, and with both Phi = 0 and dPhi/dt = 0
-enforced, the second by one more multiplier for each constraint (in the formulation of Gear, Gupta and Leimkuhler, GGL
-for short). The multipliers come with the solution, and derivatives pass through, those by lengths in the constraint
-included. `consistent_initial` moves a start onto the constraint.
+`System(mass, force, constraint)` with `constraint(q, t, params) -> (m,)` describes a mechanism with more coordinates
+than freedoms. The `hht` family solves it, by default with one linear solve per step. Both Phi = 0 and dPhi/dt = 0 are
+enforced, the latter by a second multiplier for each constraint (the formulation of Gear, Gupta and Leimkuhler, GGL).
+The solution contains the multipliers. Derivatives work, also with respect to lengths in the constraint.
+`consistent_initial` moves a start onto the constraint.
 
 >>> rod = hhtjax.System(
 ...     mass=lambda q, params: params["m"] * jnp.ones(2),
@@ -93,21 +94,22 @@ included. `consistent_initial` moves a start onto the constraint.
 >>> run.multipliers.shape, float(run.info.constraint.max()) < 1e-10      # minus the tension; how far the length drifts
 ((1001, 1), True)
 
-Constraints that depend on each other, always or in a singular position, are named with an error;
-`hht(redundant="least_squares")` solves them all the same, with the smallest multipliers.
+Constraints that depend on each other, always or in a singular position, raise an error that names them.
+`hht(redundant="least_squares")` solves them with the smallest multipliers.
 
 Contact
 -------
 
-`System(..., contact=Contact(gap, sliding, friction, restitution))`: bodies in a plane that land on each other, rest,
-stick, slide and let go, at up to four places. `gap(q, t, params)` gives the distances and `sliding(q, v, t, params)`
-the velocities along the surfaces; friction is Coulomb's, and restitution the part of the normal impulse that returns.
-Nothing is made smooth or soft: a body at rest does not creep, and a closed gap is closed to rounding.
+`System(..., contact=Contact(gap, sliding, friction, restitution))` describes bodies in a plane that collide, rest,
+stick, slide and separate, at up to four contacts. `gap(q, t, params)` returns the distances, and
+`sliding(q, v, t, params)` the velocities along the surfaces. Friction is Coulomb's. Restitution is the ratio of the
+normal impulse of expansion to that of compression. Nothing is smoothed or softened: a body at rest does not creep, and
+a closed gap is closed to rounding.
 
     M(q) w = Q + B^T L + J^T (f_N, f_T),    f_N >= 0,    f_N g = 0,    |f_T| <= mu f_N
 
-A ball that bounces to rest, and from when on it rests: sqrt(2 H/g) (1 + e)/(1 - e), with all its infinitely many
-bounces, of which those shorter than a step are left out:
+Example: a ball that bounces until it rests. It rests from sqrt(2 H/g) (1 + e)/(1 - e) on. This time includes infinitely
+many bounces; those shorter than a step are not computed:
 
 >>> floor = hhtjax.Contact(gap=lambda q, t, params: q[0], restitution="e")
 >>> ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: 0 * q - 9.81, contact=floor)
@@ -116,22 +118,23 @@ bounces, of which those shorter than a step are left out:
 >>> float(run.contact.normal[-1, 0]), round(float(run.contact.rests_since[-1, 0]), 3)               # 3 sqrt(2/9.81)
 (9.81, 1.355)
 
-The `hht` family solves it, in steps of any sizes, with M(q), constraints, rotations that keep the contact in its plane,
-internal states, inputs, `sweep` and `fit`. It is of order 2 in q, v and the forces through all impacts and switches,
-and derivatives are those of the run. Not in it: more than four contacts, sliding in two directions, restitution where a
-body meets one that rests on others. MuJoCo is made for these. Figures beside other ways are on a page,
-`experiments/contact/README.md`.
+The `hht` family supports contact with steps of any sizes, M(q), constraints, rotations that keep the contact in its
+plane, internal states, inputs, `sweep` and `fit`. It has order 2 in q, v and the forces through all impacts and
+switches, and derivatives are those of the run. Not supported: more than four contacts, sliding in two directions, and
+restitution where a body collides with one that rests on others. Use MuJoCo for these. The page
+`experiments/contact/README.md` compares with other approaches.
 
-A stiff spring in the place of contact needs far shorter steps, and makes energy where they are too long, without a sign
-of it: `hhtjax.analysis.energy_balance(system, run).check()` tells.
+A stiff spring instead of contact needs far shorter steps. If they are too long it generates energy without a warning;
+`hhtjax.analysis.energy_balance(system, run).check()` detects this.
 
 Internal states
 ---------------
 
-Hysteresis, the bristles of friction, the current of a motor, the integral of a controller, a Maxwell branch: what has a
-rate, and no position, is a z behind q and v, any pytree, zdot = g(q, v, z, t). It is solved along with the motion, in
-the same factorisation and to the same order, however fast it is, by the `hht` family, Rosenbrock methods and (unless it
-is fast) Runge-Kutta methods, with constraints, rotations, sweeps and gradients. Forces take z too.
+An internal state z has a rate but no position: zdot = g(q, v, z, t). Examples are hysteresis, the bristles of a
+friction model, the current of a motor, the integral of a controller, and a Maxwell branch. z is any pytree and follows
+q and v in argument lists. It is solved together with the motion, in the same factorisation and to the same order,
+however fast it is. The `hht` family, Rosenbrock methods and (unless z is fast) Runge-Kutta methods support it, with
+constraints, rotations, sweeps and gradients. Forces take z too.
 
 >>> def torque(q, v, z, t, params):
 ...     return params["kt"] * z["current"] - 0.01 * v
@@ -147,17 +150,17 @@ is fast) Runge-Kutta methods, with constraints, rotations, sweeps and gradients.
 >>> hhtjax.interpolate(run, jnp.array([0.123])).z["current"].shape
 (1, 1)
 
-`hhtjax.scenes` has motors, Bouc-Wen hysteresis, LuGre friction and a rubber mount. Relays, whose g jumps, are none of
-these, nor is dry friction without bristles.
+`hhtjax.scenes` has motors, Bouc-Wen hysteresis, LuGre friction and a rubber mount. Relays, whose g jumps, and dry
+friction without bristles cannot be internal states; use `Event` or `friction=`.
 
 Coordinates without mass
 ------------------------
 
-A node between two springs, or between a spring and a damper, has no mass, and so no acceleration that forces give: a
-singular mass is an error. Where forces on it depend on positions alone, their balance is a `constraint`, and M may be
-singular. It has no reaction: the multiplier is 0. Where a damper sits at it, the balance is its velocity, and the node
-an internal state. Here a mass on two springs of 300 and 600 N/m in a row, which are one of 200 N/m; and on a spring of
-300 N/m in a row with a damper of 50 N s/m.
+A node between two springs, or between a spring and a damper, has no mass. Its acceleration does not follow from forces,
+and a singular mass is an error. If the forces on it depend on positions only, write their balance as a `constraint`; M
+may then be singular. Its multiplier is 0, since the balance needs no reaction. If a damper acts on it, the balance
+gives its velocity, and the node is an internal state. The example has a mass on two springs of 300 and 600 N/m in
+series, equal to one of 200 N/m; and a mass on a spring of 300 N/m in series with a damper of 50 N s/m.
 
 >>> def springs(q, v, t, params):
 ...     node, end = q
@@ -174,18 +177,19 @@ an internal state. Here a mass on two springs of 300 and 600 N/m in a row, which
 Dry friction
 ------------
 
-Coulomb's law says what friction is while a joint slides, and only a bound while it sticks:
+Coulomb's law gives the friction force of a sliding joint. For a sticking joint it only gives a bound:
 
     M(q) w = Q + B^T L - H^T tau,    tau = F sign(s) where s != 0,    |tau| <= F where s = 0
 
-`System(..., friction=limit)` has the limits F(q, v, t), one for each coordinate, 0 where nothing rubs; with `sliding`,
-s(q, v, t), one for each of its rows, up to 8. F may fall with speed from a stiction (Stribeck), and depend on position,
-time, internal states, and the multipliers of constraints, that is, on normal loads. Nothing is made smooth: what sticks
-does not creep. The `hht` family solves it with one factorisation per step and is of order 2 in q, v and z through every
-switch, with M(q), constraints, rotations and internal states; derivatives converge to those of the exact motion, so
-limits can be fitted. The best step is still short beside the time a joint slides or sticks: the second of two switches
-of a single joint in one step waits for the next. Several joints, coupled by their inertia or not, are followed from
-switch to switch within the step, as the switch of one jerks the others.
+`System(..., friction=limit)` takes the limits F(q, v, t), one for each coordinate, 0 where there is no friction. With
+`sliding`, s(q, v, t), it takes one for each row of s. F may fall with speed from a stiction (Stribeck), and may depend
+on position, time, internal states, and on the multipliers of constraints, that is, on normal loads. Nothing is
+smoothed: a sticking joint does not creep. The `hht` family solves the law with one factorisation per step. It has order
+2 in q, v and z through every switch, with M(q), constraints, rotations and internal states. Derivatives converge to
+those of the exact motion, so limits can be fitted. Choose a step that is short compared with the times during which a
+joint slides or sticks: if a single joint switches twice in one step, the second switch is delayed to the next step.
+Several joints are followed from switch to switch within the step, whether their inertia couples them or not, because
+the switch of one makes the acceleration of the others jump.
 
 >>> def force(q, v, t, params):
 ...     return -params["k"] * q + 6.0 * jnp.sin(2.0 * t)
@@ -198,26 +202,25 @@ switch to switch within the step, as the switch of one jerks the others.
 >>> run.friction.shape, round(float(run.sticking.mean()), 2)                       # tau; part of the time it sticks
 ((801, 1), 0.32)
 
-What rolls, or glides on a knife edge, is held in its velocities, for which `constraint` has no place: it is a joint
-that never slides, with those velocities as `sliding`, and a limit beyond all forces; tau are then the forces that hold
-it. It has to start without sliding.
+Rolling, or gliding on a knife edge, is a velocity constraint, which `constraint` cannot express. Describe it as a joint
+that never slides: take the velocities that must be zero as `sliding`, with a limit larger than all forces. tau are then
+the constraint forces. The start must not slide.
 
-On a belt with the speed u, `sliding=lambda q, v, t, params: v - params["u"]`; between two bodies it is the difference
-of their velocities. s must be affine in v. Its rows, up to 16, may depend on each other and on constraints: all joints
-of a closed loop rub, and those of a mechanism whose crank is driven. The motion is unique, the forces at joints that
-stick are not; `System` says which are given. A limit in a
-system with internal states is called as limit(q, v, z, t, params), with a constraint as limit(q, v, L, t, params). F is
-to be continuous: a jump from stiction to sliding is written as a steep Stribeck curve. Between saved times
-`interpolate` is of order 2 only where a joint switches. `energy_balance` knows what friction takes, and what a belt
-gives.
+On a belt with speed u, `sliding=lambda q, v, t, params: v - params["u"]`; between two bodies it is the difference of
+their velocities. s must be affine in v. It has up to 16 rows, which may depend on each other and on constraints: all
+joints of a closed loop may have friction, or those of a mechanism whose crank is driven. The motion is then unique, but
+the forces at sticking joints are not; `System` says which are returned. A limit in a system with internal states is
+called as limit(q, v, z, t, params), with a constraint as limit(q, v, L, t, params). F must be continuous: write a jump
+from stiction to sliding as a steep Stribeck curve. Between saved times `interpolate` has only order 2 where a joint
+switches. `energy_balance` accounts for the energy that friction dissipates and that a belt supplies.
 
 Many unknowns
 -------------
 
-A beam, a cable, a frame or a net is many small parts, each a function of its own few nodes. `System.from_elements` adds
-them up, and from where they are follows how a step is solved: its cost grows with the number of nodes, not with its
-cube. `hhtjax.elements` has beams, cables, springs and joints, but any function will do. A cantilever of 100 elements
-that is bent to a circle by the moment at its tip, 2 pi EI/L, slowly and with damping:
+A beam, a cable, a frame or a net consists of many small parts, each a function of its own few nodes.
+`System.from_elements` sums them. Their connections determine how a step is solved: its cost grows with the number of
+nodes, not with its cube. `hhtjax.elements` has beams, cables, springs and joints, but any function works. Example: a
+cantilever of 100 elements that is bent to a circle by the moment 2 pi EI/L at its tip, slowly and with damping:
 
 >>> import numpy as np
 >>> from hhtjax import Elements, elements
@@ -236,17 +239,17 @@ that is bent to a circle by the moment at its tip, 2 pi EI/L, slowly and with da
 >>> round(float(run.q["theta"][-1, -1] / jnp.pi), 2), bool(jnp.max(jnp.abs(run.q["r"][-1, -1])) < 0.01)
 (2.0, True)
 
-A system that is one function, with thousands of unknowns of which each meets a few, takes `hht(solve=sparse_lu())`,
-which reads from the functions which ones: with constraints, internal states and rotations, too.
+If a system is a single function of thousands of unknowns, each coupled to a few others, use `hht(solve=sparse_lu())`.
+It finds the couplings from the functions. It works with constraints, internal states and rotations, too.
 
 Rotations
 ---------
 
-A leaf R (3, 3) of q, or several as (k, 3, 3), whose leaf of v has shape (3,) or (k, 3), is a rotation from material
-(body-fixed) to spatial components, and that leaf its material angular velocity, Rdot = R hat(Om). The `hht` family
-turns it by rotation vectors (`kinematics="chart"`) or directly (`"lie"`), both of second order for any inertia, and
-keeps it orthogonal to rounding. `hhtjax.rotation` has the exponential, the logarithm, the tangent maps and their
-derivatives, right at zero too.
+A leaf R (3, 3) of q, or several as (k, 3, 3), is a rotation from material (body-fixed) to spatial components. Its leaf
+of v, of shape (3,) or (k, 3), is the material angular velocity Om, with Rdot = R hat(Om). The `hht` family integrates
+it by rotation vectors (`kinematics="chart"`) or directly (`"lie"`). Both have second order for any inertia, and keep R
+orthogonal to rounding. `hhtjax.rotation` has the exponential, the logarithm, the tangent maps and their derivatives,
+which are correct at zero too.
 
 >>> def gyroscopic(R, Om, t, params):
 ...     return -jnp.cross(Om, params["J"] * Om)
@@ -257,6 +260,6 @@ derivatives, right at zero too.
 >>> run.q.shape, hhtjax.rotation.log(run.q[-1]).shape
 ((401, 3, 3), (3,))
 
-What became of the figures of Cardona and Geradin, and what a non-iterative step does to them, is on a page of its own,
-`experiments/cardona_geradin1989/README.md`.
+The page `experiments/cardona_geradin1989/README.md` repeats the figures of Cardona and Geradin, and shows the effect of
+a non-iterative step on them.
 """

@@ -1,6 +1,6 @@
-"""Whether r of `System(dynamics=r)` is affine in w: looked at once for a function, where numbers are known.
+"""Checks whether r of `System(dynamics=r)` is affine in w, once for a function, with concrete numbers.
 
-Where its slope does not read w, that is all; else r is evaluated at four accelerations.
+If the derivative with respect to w does not read w, the check is done. Otherwise r is evaluated at four accelerations.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _known: WeakSet = WeakSet()
 def require_affine(
     caller: str, system: AnySystem, q0: PyTree, v0: PyTree, t0: Real, params: PyTree, z0: PyTree = None
 ) -> None:
-    """An error for `dynamics` that is not affine in w; what brings `is_affine` is taken at its word."""
+    """Raises an error for `dynamics` that is not affine in w; an object with an attribute `is_affine` is trusted."""
     dynamics: Any = getattr(system, "dynamics", None)
     if dynamics is None or getattr(dynamics, "is_affine", False) or is_tracing() or not all_concrete((q0, v0, params)):
         return
@@ -40,7 +40,7 @@ def require_affine(
 
 
 def _look(caller: str, dynamics: Callable, q0: PyTree, v0: PyTree, t0: Real, params: PyTree, z0: PyTree):
-    """The error, if r is not affine."""
+    """The violation, if r is not affine."""
     v, unravel = ravel_pytree(v0)
     z = () if z0 is None else (z0,)
 

@@ -1,4 +1,4 @@
-"""From elements to a system: its mass, its force, its constraints, and which of its unknowns meet."""
+"""From elements to a system: its mass, its force, its constraints, and which of its unknowns are coupled."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NAME = "System.from_elements"
 
 @dataclass(frozen=True)
 class ElementForce:
-    """Q(q, v, t) of all elements; of what is held, its acceleration."""
+    """Q(q, v, t), the sum over all elements; for held coordinates their acceleration."""
 
     elements: Any
     held: Held | None
@@ -58,7 +58,7 @@ class ElementConstraint:
 
 @dataclass(frozen=True)
 class ElementMass:
-    """M, (n,) or `Sparse`: what sits at the nodes, and what elements bring; 1 of what is held."""
+    """M, (n,) or `Sparse`: the sum of the masses at nodes and of elements; 1 for held coordinates."""
 
     nodal: Any  # a function of params, `Fixed`, or None
     elements: Any  # a `Sum` of `Elements`, or None
@@ -84,7 +84,7 @@ class ElementMass:
         return parts_of(self.elements)
 
     def diagonal(self, v: PyTree, params: PyTree) -> Array:
-        """(n,): what sits at the nodes."""
+        """(n,): the masses at the nodes."""
         flat, _ = ravel_pytree(v)
         if self.nodal is None:
             return jnp.zeros_like(flat)
@@ -98,19 +98,19 @@ class ElementMass:
         raise ValueError(f"{NAME}: `mass` must be structured like v, or have shape ({flat.size},); received {given!r}.")
 
     def free(self, v: PyTree, params: PyTree) -> Array:
-        """(n,): what is not held."""
+        """(n,): which coordinates are not held."""
         if self.held is None:
             return jnp.ones(ravel_pytree(v)[0].shape, bool)
         return ~ravel_pytree(accelerations(self.held, v, 0.0, params).here)[0]
 
     def product(self, q: PyTree, w: PyTree, params: PyTree) -> PyTree:
-        """M w of the elements alone."""
+        """M w from the elements only."""
         return reduce(lambda x, y: jax.tree.map(jnp.add, x, y), [x.product(q, w, params) for x in self.parts])
 
 
 @dataclass(frozen=True)
 class ElementInertia:
-    """M w, without M."""
+    """M w, without forming M."""
 
     mass: ElementMass
 
@@ -124,7 +124,7 @@ class ElementInertia:
 
 
 def _broadcast(m: Real, x: Array) -> Array:
-    """A mass for each number of a leaf: one for all, one for each node, or one for each number."""
+    """A mass for each number of a leaf, from one for all, one for each node, or one for each number."""
     m = jnp.asarray(m)
     if m.ndim > x.ndim or any(a not in (1, b) for a, b in zip(m.shape, x.shape, strict=False)):
         raise ValueError(
@@ -139,7 +139,7 @@ def _zero(v: PyTree) -> PyTree:
 
 
 def _collected(numbers: Array, table: np.ndarray | tuple, size: int) -> Array:
-    """(size,): what numbers add up to at each place."""
+    """(size,): the sum of the numbers at each place."""
     if isinstance(table, tuple):
         return jax.ops.segment_sum(numbers, table[0], size)
     numbers = jnp.append(numbers, jnp.zeros_like(numbers[:1]))
@@ -152,7 +152,8 @@ def _key(dofs: np.ndarray) -> tuple:
 
 @lru_cache(maxsize=64)
 def _mass_pattern(keys: tuple, n: int):
-    """The `Pattern` of a mass, which numbers come to each of its slots, and rows and columns of the slots (n: none)."""
+    """The `Pattern` of a mass, which numbers are summed in each of its entries, and rows and columns of the entries (n:
+    unused)."""
     i = np.arange(n)
     pairs: list = [(i, i)]
     for data, shape in keys:
@@ -168,7 +169,7 @@ def _mass_pattern(keys: tuple, n: int):
 
 
 def put_together(parts: tuple, mass: Any, held: Any):
-    """mass, force, constraint and inertia of a system, or an error."""
+    """mass, force, constraint and inertia of a system; raises errors for wrong arguments."""
     if not parts or not all(isinstance(x, (Elements, Joints)) for x in parts):
         raise TypeError(f"{NAME}: give Elements and Joints; received {parts!r}.")
     elements = [x for x in parts if isinstance(x, Elements)]
@@ -185,12 +186,12 @@ def put_together(parts: tuple, mass: Any, held: Any):
 
 
 def _checked_mass(mass: Any, held: Held | None) -> ElementMass:
-    """The mass as it was given, or an error."""
+    """The mass as it was given, checked."""
     given = list(mass) if isinstance(mass, (tuple, list)) and any(isinstance(x, Elements) for x in mass) else [mass]
     elements = [x for x in given if isinstance(x, Elements)]
     nodal = [x for x in given if not isinstance(x, Elements)]
     if len(nodal) > 1:
-        raise TypeError(f"{NAME}: `mass` must hold one part that sits at nodes, and Elements; received {mass!r}.")
+        raise TypeError(f"{NAME}: `mass` must hold one mass at the nodes, and Elements; received {mass!r}.")
     for x in elements:
         require_function(
             NAME, "mass", x.function, "mass(q, w, params)" if x.each is None else "mass(q, w, params, each)"

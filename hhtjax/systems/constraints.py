@@ -1,9 +1,9 @@
-"""Constraints Phi(q, t) = 0: their rates, their reactions, and which of them depend on each other.
+"""Constraints Phi(q, t) = 0: their rates, their reactions, and whether they depend on each other.
 
     M(q) w = Q(q, v, t) + B^T L,    B = dPhi/dq
 
-A multiplier L_i is the reaction that constraint i exerts along its own gradient: of the unit of force for a Phi in
-units of length. (The IVP test set writes -B^T lambda: its multipliers are the negatives of these.)
+A multiplier L_i is the reaction that constraint i exerts along its own gradient; if Phi has the unit of length, L_i has
+the unit of force. (The IVP test set writes -B^T lambda: its multipliers have the opposite sign.)
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 
 GRADIENT = 64  # times what roundings of q change a constraint and its gradient, below which it has none
 SWITCHED_OFF = (
-    "A row that params switch off, on * Phi, leaves its multiplier without an equation: let it hold a coordinate s of "
+    "A row that params switch off, on * Phi, leaves its multiplier without an equation. Let the row hold a coordinate "
+    "s of "
     'its own instead, on * Phi + (1 - on) * s, as in hhtjax.scenes.shaken_table, or take redundant="least_squares"'
 )
 SHAKES = 3  # by a rounding
@@ -47,7 +48,7 @@ def violation(system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree):
 
 
 def curvature(system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) -> Array:
-    """The part of the second time derivative of Phi that w does not enter: (m,)."""
+    """The part of the second time derivative of Phi that does not depend on w: (m,)."""
 
     def rate(q: Array, t: Array) -> Array:
         return violation(system, q, v, t, params)[1]
@@ -69,7 +70,7 @@ def violation_and_reaction(system: FlatSystem, q: Array, v: Array, t: Array, par
 
 
 def pull_back(system: FlatSystem, q: Array, gradient: Array) -> Array:
-    """The force (n,) of a gradient with respect to q: the same, and the material moment for rotations."""
+    """The force (n,) for a gradient with respect to q: equal to it for positions; the material moment for rotations."""
     zero = jnp.zeros(system.size, q.dtype)
     return jax.linear_transpose(lambda v: system.rate(q, v), zero)(gradient)[0]
 
@@ -91,7 +92,7 @@ def saddle_point(system: FlatSystem, q: Array, t: Array, params: PyTree, factori
 
 
 def _sparse_saddle_point(system: FlatSystem, q: Array, t: Array, params: PyTree):
-    """The same without matrices."""
+    """As above, without matrices."""
     n, (push, pull) = system.size, gradient_maps(system, q, t, params)
 
     def f(z: Array) -> Array:
@@ -121,8 +122,8 @@ def gradient_maps(system: FlatSystem, q: Array, t: Array, params: PyTree):
 def answers(
     system: FlatSystem, q: Array, t: Array, params: PyTree, redundant=None, factorize: Callable | None = None
 ) -> Any:
-    """The function (force, rows=0) -> (dw, dL), factorised once: what more of a force makes of the accelerations and
-    the multipliers, which are None without constraints. rows: B dw. redundant, factorize: how it is solved."""
+    """The function (force, rows=0) -> (dw, dL), factorised once: the change of accelerations and multipliers for an
+    additional force. dL is None without constraints. rows: B dw. redundant, factorize: how it is solved."""
     if not system.num_constraints:
         inverse = system.mass_solver(system.mass(q, t, params), *(() if factorize is None else (factorize,)))
         return lambda force, rows=None: (inverse(force), None)
@@ -148,7 +149,7 @@ def jacobian(system: FlatSystem, q: Array, t: Array, params: PyTree) -> Array:
 
 
 def check_redundant(caller: str, redundant):
-    """An error for what is no value of `redundant`."""
+    """Raises an error for an unknown value of `redundant`."""
     if redundant not in (None, "least_squares"):
         raise ValueError(f'{caller}: `redundant` must be None or "least_squares"; received {redundant!r}.')
 
@@ -159,8 +160,8 @@ def factorize_constrained(n: int, redundant):
 
 
 def gradient(system: FlatSystem, q: Array, t: Array, params: PyTree):
-    """B, and which of its rows, (m,), are more than rounding, whatever the units: of those that are not, q changed by a
-    rounding changes the row, or the constraint by as much as q would if it changed by all of its size."""
+    """B, and which of its rows, (m,), are more than rounding in any units. A row is rounding if a rounding of q changes
+    it completely, or changes the constraint by as much as a change of q by its own size would."""
     k, sizes = np.arange(system.positions), kinematics.sizes(system.blocks, q)
     uneven = [np.where(k // 2**i % 2, -1, 1) * (0.75 + 0.618034 * (i + 1) * k % 0.5) for i in range(SHAKES)]
     shakes = float(jnp.finfo(q.dtype).eps) * jnp.asarray(np.stack([0 * k, *uneven]), q.dtype) * sizes[None, :]
@@ -177,13 +178,13 @@ def gradient(system: FlatSystem, q: Array, t: Array, params: PyTree):
 
 
 def require_independent(caller: str, B: np.ndarray, clear: np.ndarray):
-    """An error that names the rows of B that depend on each other, or are not clear (`gradient`)."""
+    """Raises an error that names the rows of B that depend on each other, or are rounding (`gradient`)."""
     size = np.linalg.norm(B, axis=1)
     empty = np.flatnonzero(~np.asarray(clear)).tolist()
     if empty:
         raise ValueError(
-            f"{caller}: `constraint` rows {empty} have no gradient in q at the start but for rounding, or not a finite "
-            f"one. {SWITCHED_OFF}."
+            f"{caller}: `constraint` rows {empty} have no gradient in q at the start (only rounding), or one that is "
+            f"not finite. {SWITCHED_OFF}."
         )
     left, values, _ = np.linalg.svd(B / size[:, None])
     values = np.pad(values, (0, len(B) - len(values)))  # of more rows than coordinates
@@ -198,9 +199,10 @@ def require_independent(caller: str, B: np.ndarray, clear: np.ndarray):
 
 
 def dependent_row(B: Array) -> Array:
-    """Index of the first row of B (m, n) that depends on those above it, to a part in 1e6; -1 for none.
+    """Index of the first row of B (m, n) that depends on the rows above it, to a part in 1e6; -1 if none does.
 
-    The pivots of an elimination on the cosines between the rows: sin^2 of the angle to the span of the rows above.
+    These are the pivots of an elimination on the cosines between the rows: sin^2 of the angle to the span of the rows
+    above.
     """
     m, limit = B.shape[0], 1e4 * float(jnp.finfo(B.dtype).eps)
     size = jnp.sqrt(jnp.sum(B**2, axis=1, keepdims=True))
@@ -221,7 +223,7 @@ def dependent_row(B: Array) -> Array:
 
 
 def sparse_dependent_row(system: FlatSystem, q: Array, t: Array, params: PyTree) -> Array:
-    """The same of a system with a sparse solve, of the rows in the order in which this takes them."""
+    """As `dependent_row`, for a system with a sparse solve; rows are taken in the order of that solve."""
     assert system.sparse is not None
     push, pull = gradient_maps(system, q, t, params)
     limit = 1e4 * float(jnp.finfo(q.dtype).eps)

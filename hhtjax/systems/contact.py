@@ -1,4 +1,4 @@
-"""Contact in one plane: where bodies touch, how they slide on each other, and what they do to the accelerations.
+"""Contact in a plane: where bodies touch, how they slide on each other, and how this affects the accelerations.
 
     g = gap(q, t) >= 0,    s = sliding(q, v, t),    y = (dg/dt, s),    J = dy/dv
     M(q) w = Q(q, v, t) + B^T L + J^T (f_N, f_T),    f_N >= 0,    f_N g = 0
@@ -31,41 +31,43 @@ MOST = 4  # contacts
 
 
 class Fault:
-    """What may go wrong with contacts: the codes of steps and runs, as floats; 0 nothing."""
+    """The codes of failures of contacts in steps and runs, as floats; 0 is no failure."""
 
     NO_FORCES, MANY, JAMMED, SEVERAL, OPEN, OVERLAP, APPROACH, RANGE = (float(k) for k in range(1, 9))
 
 
 @dataclass(frozen=True, eq=False)
 class Contact(Description):
-    """Contacts of bodies in a plane, for `System(contact=)`: they rest, stick, slide and let go.
+    """Contacts of bodies in a plane, for `System(contact=)`: they collide, rest, stick, slide and separate.
 
     Args:
-        gap: g, `gap(q, t, params)` -> (m,), or a number: the distances, m, positive where bodies are apart; smooth.
-            m <= 4.
+        gap: g, `gap(q, t, params)` -> (m,), or a number: the distances, m, positive where bodies are apart; smooth. m
+            <= 4.
         sliding: s, `sliding(q, v, t, params)` -> (m,), or a number: the velocities along the surfaces, m/s, affine in
-            v. In one plane: a contact slides along one line.
-        friction: mu >= 0, Coulomb's: a number, (m,), the name of one in params, or a function of params. It needs
-            `sliding`.
-        restitution: e in [0, 1], the part of the normal impulse of compression that the expansion gives back (Poisson),
-            given as mu is.
+            v. The problem is planar: a contact slides along one line.
+        friction: mu >= 0, Coulomb's coefficient: a number, (m,), the name of one in params, or a function of params. It
+            needs `sliding`.
+        restitution: e in [0, 1], the ratio of the normal impulse of expansion to that of compression (Poisson); given
+            in the same forms as mu.
 
-    The `hht` family solves it. Closed contacts are modes of its step, which is divided where one switches or lands: q,
-    v and the forces are of order 2 through all of it, and gaps are closed to rounding. `run.contact` has the forces.
+    Supported by the `hht` family. A step is divided where a contact lands or switches between sticking, sliding and
+    separation. q, v and the forces have order 2 through all switches, and gaps of closed contacts are 0 to rounding.
+    `run.contact` holds the forces.
 
-    e holds where one contact lands by itself. Where it touches one that is closed it lands with e = 0; where several
-    that touch each other land at once, e > 0 is a failure, as the order would count. A contact whose flight would be
-    shorter than a step stays closed, so that bounces come to an end. Forces of contacts that depend on each other, such
-    as friction at both feet of a table, are determined in their sums alone.
+    e applies to a contact that lands by itself. A contact that lands while a closed contact depends on it (an impulse
+    at one changes the velocity at the other) lands with e = 0. If several such contacts land at the same time, e > 0 is
+    a failure, because the outcome would depend on their order. A contact whose flight would be shorter than a step
+    stays closed, so bouncing ends. Forces of contacts that depend on each other, such as friction at both feet of a
+    table, are only determined in sum.
 
-    Failures, named by `check()`: contacts that switch too often within a step; a contact that jams, its friction
-    pressing it together (Painleve); forces that are not found; several impacts at once with e > 0.
+    `check()` reports these failures: contacts that switch too often within a step; a contact that jams, because its
+    friction presses it together (Painleve); forces that are not found; several impacts at once with e > 0.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind, or out of its range; friction without `sliding`. In runs: a
             start in which bodies overlap, or touch and approach each other.
 
-    A system that is there already, such as that of a mechanism, gets it by `dataclasses.replace(system, contact=)`.
+    To add contact to an existing system, such as a mechanism, use `dataclasses.replace(system, contact=)`.
 
     A block that slides 0.204 m, v^2/(2 mu g), and stays there:
 
@@ -98,7 +100,7 @@ class Contact(Description):
 
 
 def _require_coefficient(name: str, value: Any, valid: Callable, expectation: str):
-    """An error for what is no number, array, name or function of params."""
+    """Raises an error unless it is a number, an array, a name or a function of params."""
     if isinstance(value, str):
         return
     if is_array(value) and np.ndim(value) == 1:
@@ -124,7 +126,7 @@ class FlatContact(NamedTuple):
 def flat_contact(
     caller: str, contact: Contact, flat: FlatSystem, q0: PyTree, v0: PyTree, t0: Real, params: PyTree, dtype: Any
 ) -> FlatContact:
-    """The `FlatContact` of a system, or an error for what its functions return."""
+    """The `FlatContact` of a system; raises an error if its functions return wrong shapes or dtypes."""
     m = _rows(caller, "gap", contact.gap, dtype, q0, t0, params)
     if contact.sliding is not None:
         rows = _rows(caller, "sliding", contact.sliding, dtype, q0, v0, t0, params)
@@ -149,7 +151,7 @@ def flat_contact(
 
 
 def _rows(caller: str, name: str, function: Callable, dtype: Any, *args: PyTree) -> int:
-    """How many numbers it returns, or an error."""
+    """The number of rows that the function returns, checked."""
 
     def as_row(*args: PyTree) -> Array:
         found = function(*args)
@@ -159,12 +161,12 @@ def _rows(caller: str, name: str, function: Callable, dtype: Any, *args: PyTree)
 
 
 def _coefficient(caller: str, name: str, given: Any, m: int, dtype: Any, params: PyTree) -> Array:
-    """(m,), from params."""
+    """A coefficient as (m,), from params."""
     params, value = thaw(params), None
     if isinstance(given, str):
         if not isinstance(params, dict) or given not in params:
             raise ValueError(
-                f"{caller}: `{name}` is the name {given!r}, which params do not have; received {params!r}."
+                f"{caller}: `{name}` must be a name in params; received {given!r} with the params {params!r}."
             )
         value = params[given]
     else:
@@ -184,7 +186,7 @@ def rates(system: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) -> A
 
 
 def directions(system: FlatSystem, q: Array, t: Array, params: PyTree) -> Array:
-    """J (2 m, N), the derivative of y in the rates."""
+    """J (2 m, N), the derivative of y with respect to the rates."""
     zero = jnp.zeros(system.size, q.dtype)
     return linear_map(jax.linearize(lambda v: rates(system, q, v, t, params), zero)[1], zero)
 
@@ -196,13 +198,14 @@ def reaction(system: FlatSystem, q: Array, t: Array, params: PyTree, f: Array) -
 
 
 def speeds(J: Array, v: Array, w: Array, h: Array) -> Array:
-    """(m,): what rates of each contact are made of in a step h, by which is told what is 0 of them."""
+    """(m,): the size of the terms that the rates of each contact consist of in a step h; what is far smaller counts as
+    0."""
     fast = product(jnp.abs(J), jnp.abs(v) + h * jnp.abs(w))
     m = len(fast) // 2
     return jnp.maximum(fast[:m], fast[m:])
 
 
 def rates_of_rates(system: FlatSystem, q: Array, v: Array, w: Array, t: Array, params: PyTree) -> Array:
-    """dy/dt, of the acceleration w: (2 m,)."""
+    """dy/dt for the acceleration w: (2 m,)."""
     along = system.rate(q, v), w, jnp.ones_like(t)
     return jax.jvp(lambda q, v, t: rates(system, q, v, t, params), (q, v, t), along)[1]

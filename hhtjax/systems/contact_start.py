@@ -1,4 +1,4 @@
-"""Where contacts may start: apart, or closed and not about to be pressed together; with coefficients in range."""
+"""The check of a start with contacts: bodies are apart, or touch without approaching; coefficients are in range."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ ROUNDING = 1e-12  # a gap that is always 0: what is known of its size may be 0
 def require_contact_start(
     caller: str, system, q0: PyTree, v0: PyTree, t0: Real, params: PyTree, z0: PyTree = None
 ) -> None:
-    """An error for a start in which bodies overlap, or touch and go into each other, and for coefficients out of their
-    range; tracers pass."""
+    """Raises an error for a start in which bodies overlap, or touch and approach each other, and for coefficients out
+    of range; tracers pass."""
     found = known_now(_start, system, q0, v0, t0, params, z0)
     if found is None:
         return
@@ -46,7 +46,7 @@ def require_contact_start(
             )
         raise ValueError(
             f"{caller}: `v0` must not press bodies together that touch: the gap of contact {i} is 0 and changes by "
-            f"{speed.min():.6g} a unit of time; expected 0 or more. Start before the impact, or behind it."
+            f"{speed.min():.6g} a unit of time; expected 0 or more. Start before the impact, or after it."
         )
 
 
@@ -78,7 +78,7 @@ def start_flaws(flat: FlatSystem, q: Array, v: Array, t: Array, params: PyTree) 
 
 
 def nearly_closed(flat: FlatSystem, q: Array, J: Array) -> Array:
-    """(m,): the gaps that count as 0 at a start, beside the coordinates that they are made of."""
+    """(m,): the size of gaps that count as 0 at a start, relative to the coordinates from which they are computed."""
     few = float(jnp.finfo(q.dtype).eps) / float(jnp.finfo(jnp.float64).eps)
     size = kinematics.sizes(flat.blocks, q)
     gap_of = jnp.abs(J[: len(J) // 2, : size.shape[0]])

@@ -1,10 +1,10 @@
-"""The matrix of a step of a system of elements: the slopes of each element along the unknowns of its own nodes.
+"""The matrix of a step of a system of elements, from the derivatives of each element in the unknowns of its own nodes.
 
     A = d(M w - Q)/dx = sum_e P_e^T (d r_e / d x_e) P_e
 
-The unknowns x of a step move position, velocity and acceleration at its end, and those of a node move that node alone:
-by three numbers where there are no rotations, else by small matrices. So all elements of a kind take as many tangents
-as one of them has unknowns.
+The unknowns x of a step change position, velocity and acceleration at its end; those of a node change that node only.
+Without rotations these changes are three numbers, with rotations small matrices. So all elements of a kind together
+need as many tangents as one of them has unknowns.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 
 class Changes(NamedTuple):
-    """What x does to q, v and w. Without rotations: a number for each. Else pytrees of leaves (d, N, ...): what each of
-    the d numbers of a node does, at all nodes."""
+    """The change of q, v and w by x. Without rotations: a number for each. With rotations: pytrees of leaves (d, N,
+    ...) with the changes by each of the d numbers of a node, at all nodes."""
 
     q: Any
     v: Any
@@ -93,7 +93,7 @@ class StepMatrix:
         return Changes(*(jax.vmap(f)(x) for f, x in zip(ways, (change.q, change.v, change.w), strict=True)))
 
     def _of_nodes(self, d: Array, changes: Changes) -> Array:
-        """Of what sits at the nodes, d (n,)."""
+        """The contribution of masses d (n,) at nodes."""
         if not self.flat.blocks:
             return changes.w * d
         rows, columns = self.at_nodes
@@ -101,7 +101,7 @@ class StepMatrix:
         return d[rows] * w[self.number[columns], rows]
 
     def _slopes(self, part: Elements, f: Callable, at: tuple, changes: tuple, params: PyTree) -> Array:
-        """(s E s,): of f, of two arguments, at (q, v) or (q, w), in the order of `_pairs`."""
+        """(s E s,): the derivatives of f, of two arguments, at (q, v) or (q, w), in the order of `_pairs`."""
         own, axes = part.own_numbers(params, jnp.result_type(jax.tree.leaves(at[1])[0]))
         at = tuple(map(part.own, at))
         zero, unravel = ravel_pytree(jax.tree.map(lambda x: x[0], at[1]))
@@ -119,7 +119,7 @@ class StepMatrix:
 
 
 def _within_nodes(v: PyTree) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) each: the number of an unknown within its node, and a number for each leaf and node."""
+    """(n,) each: the index of an unknown within its node, and a number for each leaf and node."""
     numbers, nodes, first, place = [], [], 0, 0
     for x in jax.tree.leaves(v):
         N, r = np.shape(x)[0], int(np.prod(np.shape(x)[1:], dtype=int))
@@ -139,7 +139,8 @@ def _same_node(number: np.ndarray, leaf: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _pairs(part: Elements, v: PyTree) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the slopes of leaves (s, E, k, ...) along each of the s unknowns of an element, in a row."""
+    """Rows and columns of the derivatives of leaves (s, E, k, ...) in each of the s unknowns of an element,
+    flattened."""
     dofs = part.dofs(v)
     s, rows, columns = dofs.shape[1], [], []
     for own in part.dofs_of_leaves(v):  # (E, k ...)
@@ -149,7 +150,7 @@ def _pairs(part: Elements, v: PyTree) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _table_in(plan: Plan, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """(d, entries): which numbers, at these rows and columns, add up to each entry of a plan."""
+    """(d, entries): which numbers, at these rows and columns, are summed in each entry of a plan."""
     entries = plan.rows.astype(np.int64) * plan.n + plan.columns
     order = np.argsort(entries)
     places = order[np.searchsorted(entries[order], rows.astype(np.int64) * plan.n + columns)]
@@ -157,7 +158,8 @@ def _table_in(plan: Plan, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def _at_own_nodes(change: PyTree, number: np.ndarray, units: PyTree) -> PyTree:
-    """Leaves (s, E, k, ...): of changes (d, E, k, ...) by the numbers of a node, those by unknowns of an element."""
+    """Leaves (s, E, k, ...): changes by the unknowns of an element, from changes (d, E, k, ...) by the numbers of a
+    node."""
 
     def at(change: Array, unit: Array) -> Array:
         there = np.asarray(jnp.any(unit.reshape(*unit.shape[:2], -1) != 0, axis=2))  # (s, k)

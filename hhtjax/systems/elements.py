@@ -1,7 +1,7 @@
-"""Systems of many small parts: elements between nodes, joints between them, and what holds some of them.
+"""Systems assembled from many small parts: elements between nodes, joints between them, and nodes that are held.
 
-Each part is a function of its own few nodes. From where it sits follows which unknowns meet, and with that how a step
-is solved: see `step_sparsity.py`, and `hhtjax.numerics.sparse_lu`.
+Each part is a function of its own few nodes. Which nodes these are determines which unknowns are coupled, and so how a
+step is solved: see `step_sparsity.py`, and `hhtjax.numerics.sparse_lu`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MOST_SHARED = 16  # elements at a node, up to which their forces are gathered
 
 
 class Fixed:
-    """A pytree of arrays that is part of the program: known by its numbers."""
+    """A pytree of arrays that is part of the program, and compared by its values."""
 
     def __init__(self, tree: PyTree):
         self.tree = jax.tree.map(np.asarray, tree)
@@ -49,7 +49,7 @@ class Fixed:
 
 @dataclass(frozen=True, repr=False)
 class _OnNodes:
-    """What elements and joints share: a function of some nodes, as often as there are rows of `nodes`."""
+    """Base class of elements and joints: a function of some nodes, evaluated for every row of `nodes`."""
 
     function: Callable
     nodes: Any  # given as an array, kept as `Fixed`
@@ -77,17 +77,17 @@ class _OnNodes:
 
     @property
     def count(self) -> int:
-        """E, how many there are."""
+        """E, the number of rows."""
         return len(jax.tree.leaves(self.nodes.tree)[0])
 
     def own(self, tree: PyTree) -> PyTree:
-        """The leaves (E, k, ...) of a pytree with nodes as first axis."""
+        """The leaves (E, k, ...) of a pytree whose first axis counts nodes."""
         nodes = self.nodes.tree
         if not isinstance(nodes, dict):
             return _taken(type(self).__name__, tree, nodes)
         if not isinstance(tree, dict):
             raise ValueError(
-                f"{type(self).__name__}: `nodes` must be an array, as the position is no dict; received the "
+                f"{type(self).__name__}: `nodes` must be an array, because the position is not a dict; received the "
                 f"keys {sorted(nodes)}."
             )
         unknown = [key for key in nodes if key not in tree]
@@ -98,15 +98,15 @@ class _OnNodes:
         return {key: _taken(type(self).__name__, tree[key], nodes[key]) for key in sorted(nodes)}
 
     def dofs(self, v: PyTree) -> np.ndarray:
-        """(E, s): the numbers of the unknowns of each row, in the order in which its leaves are ravelled."""
+        """(E, s): the indices of the unknowns of each row, in the order in which its leaves are ravelled."""
         return np.concatenate(self.dofs_of_leaves(v), axis=1)
 
     def dofs_of_leaves(self, v: PyTree) -> list[np.ndarray]:
-        """The same for each leaf."""
+        """The indices of the unknowns of each row, for each leaf."""
         return _numbers(self, v)
 
     def own_numbers(self, params: PyTree, dtype: np.dtype) -> tuple:
-        """(each,) with leaves (E, ...), or (); and of the same structure the axes for vmap."""
+        """(each,) with leaves (E, ...), or (); and the axes for vmap in the same structure."""
         if self.each is None:
             return (), ()
         each = self._checked_each(self.each(params)) if callable(self.each) else self.each.tree
@@ -116,7 +116,7 @@ class _OnNodes:
         return (each,), (jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, each),)
 
     def mapped(self, f: Callable, params: PyTree, *of_nodes: PyTree) -> PyTree:
-        """f(own leaves of each of these, and of `each`) for all rows of `nodes`, in the dtype of the last of them."""
+        """f(own leaves of each argument, and of `each`) for all rows of `nodes`, in the dtype of the last argument."""
         own, axes = self.own_numbers(params, jnp.result_type(jax.tree.leaves(of_nodes[-1])[0]))
         return jax.vmap(f, (*(0 for _ in of_nodes), *axes))(*map(self.own, of_nodes), *own)
 
@@ -135,15 +135,14 @@ class Elements(_OnNodes):
     """Elements of one kind between nodes, for `System.from_elements`.
 
     Args:
-        function: the generalised force on the nodes of ONE element, `function(q, v, t, params)`: leaves (k, ...) of q
-            and v are those of its k nodes, and so are those of what it returns, structured like v (a dict may leave
-            keys out: no force). Slopes are taken of it: an element that cannot be differentiated at rest, such as a
-            cable whose length is 0, needs the care that functions need. In the place of `mass` it is M w of one
-            element, `function(q, w, params)`.
-        nodes: (E, k) integers, the nodes of each element; a dict of such where q is a dict of several sets of nodes,
-            which the function then gets by these keys.
-        each: what is different from element to element: a pytree of arrays (E, ...) and of numbers that all share, or a
-            function of params that gives one. The function then gets its own part as its last argument.
+        function: the generalised force on the nodes of ONE element, `function(q, v, t, params)`. q and v have leaves
+            (k, ...) for its k nodes; the result is structured like v (a dict may omit keys without force). It is
+            differentiated: an element without a derivative in its undeformed state, such as a cable of length 0, must
+            be written so that it has one. As `mass`, it returns M w of one element, `function(q, w, params)`.
+        nodes: (E, k) integers, the nodes of each element. If q is a dict of several sets of nodes, a dict of such
+            arrays; the function then receives them by these keys.
+        each: data that differ between elements: a pytree of arrays (E, ...), and of numbers that all share, or a
+            function of params that returns one. The function then receives its own part as its last argument.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or shape.
@@ -167,7 +166,7 @@ class Elements(_OnNodes):
         return self.added(v, self.mapped(force, params, q, v))
 
     def product(self, q: PyTree, w: PyTree, params: PyTree) -> PyTree:
-        """M w of all nodes, where the function gives that of one element."""
+        """M w of all nodes, if the function returns that of one element."""
 
         def product(q: PyTree, w: PyTree, *each) -> PyTree:
             return self.complete(w, self.function(q, w, params, *each))
@@ -189,7 +188,7 @@ class Elements(_OnNodes):
         return self.mapped(matrix, params, q, v)
 
     def added(self, v: PyTree, forces: PyTree) -> PyTree:
-        """What leaves (E, k, ...) of the elements add up to at the nodes, structured like v."""
+        """The sum of leaves (E, k, ...) of the elements at the nodes, structured like v."""
         nodes = self.nodes.tree
         if not isinstance(nodes, dict):
             return jax.tree.map(partial(_summed, nodes), v, forces)
@@ -197,7 +196,7 @@ class Elements(_OnNodes):
         return {key: some[key] if key in some else jax.tree.map(jnp.zeros_like, v[key]) for key in v}
 
     def complete(self, v: PyTree, force: PyTree) -> PyTree:
-        """A force of one element with zeros for the keys that it leaves out."""
+        """A force of one element, with zeros for the keys that it omits."""
         if isinstance(v, dict) and isinstance(force, dict):
             unknown = sorted(set(force) - set(v))
             if unknown:
@@ -217,8 +216,8 @@ class Joints(_OnNodes):
     """Joints of one kind between nodes, for `System.from_elements`: constraints of a few nodes each.
 
     Args:
-        function: what is zero where ONE joint holds, `function(q, t, params)` -> (m,), its rows independent.
-        nodes, each: as of `Elements`.
+        function: zero if ONE joint is closed, `function(q, t, params)` -> (m,), with independent rows.
+        nodes, each: as in `Elements`.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or shape.
@@ -242,7 +241,7 @@ class Joints(_OnNodes):
 
 
 def _checked_nodes(name: str, nodes: PyTree) -> Fixed:
-    """The nodes as arrays of integers, or an error."""
+    """The nodes as arrays of integers; raises an error for anything else."""
     parts = nodes if isinstance(nodes, dict) else {"": nodes}
     found = {}
     for key, x in parts.items():
@@ -265,13 +264,13 @@ def _checked_nodes(name: str, nodes: PyTree) -> Fixed:
 
 
 def _taken(name: str, tree: PyTree, nodes: np.ndarray) -> PyTree:
-    """Leaves (E, k, ...) of these nodes."""
+    """The leaves (E, k, ...) of these nodes."""
 
     def take(x: Array) -> Array:
         if not jnp.ndim(x) or nodes.max() >= x.shape[0]:
             raise ValueError(
-                f"{name}: `nodes` names node {int(nodes.max())}, and a leaf of the state has shape {jnp.shape(x)}: the "
-                "first axis of all leaves is that of the nodes, counted from 0."
+                f"{name}: `nodes` contains node {int(nodes.max())}, but a leaf of the state has shape {jnp.shape(x)}: "
+                "the first axis of all leaves must count the nodes, from 0."
             )
         x = jnp.asarray(x)
         rows = _at_nodes(nodes.tobytes(), nodes.shape, x.shape[0])(x.reshape(x.shape[0], -1))
@@ -297,7 +296,7 @@ def _numbers(part: _OnNodes, v: PyTree) -> list[np.ndarray]:
 
 
 def _summed(nodes: np.ndarray, x: Array, forces: Array) -> Array:
-    """(N, ...) like x: what forces (E, k, ...) on these nodes add up to."""
+    """(N, ...) like x: the sum of forces (E, k, ...) on these nodes."""
     number = np.shape(x)[0]
     forces = forces.reshape(*nodes.shape, -1)
     return _at_nodes(nodes.tobytes(), nodes.shape, number).transpose(forces).reshape(np.shape(x))
@@ -305,9 +304,9 @@ def _summed(nodes: np.ndarray, x: Array, forces: Array) -> Array:
 
 @lru_cache(maxsize=256)
 def _at_nodes(nodes: bytes, shape: tuple, number: int) -> Linear:
-    """The map from (..., number, r) to the rows (..., E, k, r) at nodes (E, k); transposed it adds rows up.
+    """The map from (..., number, r) to the rows (..., E, k, r) at nodes (E, k); its transpose sums rows.
 
-    Where each node is the next of that of the element before, as in chains, by slices; else by gathers, both."""
+    If each element starts one node after the previous one, as in chains, both use slices; otherwise gathers."""
     places = np.frombuffer(nodes, np.int32).reshape(shape)
     starts = places[0]
     if np.array_equal(places, starts + np.arange(shape[0])[:, None]):
@@ -329,7 +328,7 @@ def _at_nodes(nodes: bytes, shape: tuple, number: int) -> Linear:
 
 
 def _in_turn(starts: list[int], count: int, number: int) -> Linear:
-    """The same where element i has the nodes starts + i."""
+    """As above, for elements i with the nodes starts + i."""
 
     def take(x: Array) -> Array:
         return jnp.stack([x[..., s : s + count, :] for s in starts], axis=-2)
@@ -343,13 +342,13 @@ def _in_turn(starts: list[int], count: int, number: int) -> Linear:
 
 
 def pairs_of(dofs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the matrices (E, s, s) of elements with the unknowns dofs (E, s), in a row."""
+    """Rows and columns of the matrices (E, s, s) of elements with the unknowns dofs (E, s), flattened."""
     s = dofs.shape[1]
     return np.repeat(dofs, s, axis=1).ravel(), np.tile(dofs, (1, s)).ravel()
 
 
 def table_of(places: np.ndarray, number: int, most: int = MOST_SHARED) -> Any:
-    """(d, number): which entries of a list come to each place, and its length where there are no more; None where there
+    """(d, number): the entries of a list that belong to each place, padded with the length of the list. None if there
     are more than `most`."""
     count = np.bincount(places, minlength=number)
     if count.max(initial=0) > most:
@@ -378,7 +377,7 @@ class Sum:
 
 @dataclass(frozen=True)
 class Rows:
-    """The rows of two constraints, one behind the other."""
+    """The rows of two constraints, concatenated."""
 
     first: Any
     second: Any

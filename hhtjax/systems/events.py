@@ -1,8 +1,8 @@
-"""Events: a guard that falls to zero, or a time that is known, and what becomes of the motion there.
+"""Events: a guard that falls to zero, or a known time, and how the motion changes there.
 
     g(q, v, t) > 0 where the motion is allowed;   at g = 0:  v := reset(q, v, t),  params := switch(params),  or the end
 
-How a step finds the time is in hhtjax/runs/event_step.py.
+hhtjax/runs/event_step.py finds the time within a step.
 """
 
 from __future__ import annotations
@@ -32,44 +32,47 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Event(Description):
-    """Something that happens where a guard falls to zero, or at known times: `simulate(..., events=[Event(...)])`.
+    """Something that happens when a guard falls to zero, or at known times: `simulate(..., events=[Event(...)])`.
 
     Args:
         guard: g, `guard(q, v, t, params)` -> a number, smooth, positive where the motion is allowed, negative beyond.
-            It counts where it falls from positive to zero, not where it rises: for the other direction give -g, for
-            both a mode that turns the sign, see `switch`. With internal states z stands behind v; of a
-            `FirstOrderSystem` guard(y, t, params). With one more argument that is named `multipliers`, as in
-            `guard(q, v, t, params, multipliers)`, it sees the multipliers L (m,) of the constraint: a contact that is
-            held by a constraint ends where its multiplier falls to zero.
-        reset: what the velocity becomes, `reset(q, v, t, params)` -> a pytree like v; or `impact(restitution)`. Of a
-            `FirstOrderSystem` what y becomes. By default nothing changes. q cannot: it has to be continuous.
-        switch: what the params become, `switch(params)`, of the same structure, shapes and dtypes; or
-            `switch(q, v, t, params)`, with the state before the event (arguments as those of a guard). So a force that
-            jumps is written with a mode, a number in params, and no `where` of the position in it: a step across the
-            jump loses its order, and one that ends on it may find itself thrown back for ever. After an event that
-            turns nothing back the guard would be negative: let it depend on the mode.
-        terminal: whether the run ends there. The state stays what it was, time included.
-        at: in the place of a guard the times at which it happens: a number, (K,) in increasing order, or
+            The event happens when g falls from positive to zero, not when it rises. For the other direction give -g;
+            for both, a mode that changes the sign, see `switch`. With internal states z follows v; for a
+            `FirstOrderSystem` write guard(y, t, params). A further argument named `multipliers`, as in
+            `guard(q, v, t, params, multipliers)`, receives the multipliers L (m,) of the constraint. So a contact that
+            a constraint holds can end when its multiplier falls to zero.
+        reset: the velocity after the event, `reset(q, v, t, params)` -> a pytree like v; or `impact(restitution)`. For
+            a `FirstOrderSystem` the new y. Default: no change. q cannot change, it must be continuous.
+        switch: the params after the event, `switch(params)`, of the same structure, shapes and dtypes; or
+            `switch(q, v, t, params)`, with the state before the event (arguments as for a guard). Use it for a force
+            that jumps: let the force depend on a mode, a number in params, and not on a `where` of the position. A step
+            across such a `where` loses its order, and one that ends on it may be thrown back again and again. If the
+            event does not turn the motion back, the guard would stay negative after it: let the guard depend on the
+            mode.
+        terminal: whether the run ends there. State and time then stay as they are up to the end of the saved times.
+        at: the times at which the event happens, instead of a guard: a number, (K,) in increasing order, or
             `at(params)` -> one of these, with the params of the start. Steps are divided there, and a run is
-            differentiable in the times. Those before t0 are over, and one at t0 happens at the start of the first step.
+            differentiable in the times. Times before t0 are ignored; one at t0 happens at the start of the first step.
 
-    An event with none of reset, switch and terminal is noted, and changes nothing: sections of a Poincare map, times of
-    passage. Of events at one time those come first. Others happen one after the other, where none changes the rate of
-    another's guard, as impacts of bodies that do not touch; else their order would matter, and the run fails by name.
+    An event without reset, switch and terminal is only recorded and changes nothing. Use it for sections of a Poincare
+    map, or times of passage. Of simultaneous events, recorded ones come first. The others happen one after the other if
+    none changes the rate of another's guard, as impacts of bodies that do not touch. Otherwise their order would
+    matter, and the run fails with a message.
 
-    A guard that jumps below zero with what another event changes, as -v does in a rebound, has not fallen there: a
-    noted event is not met, as in a run of SciPy's that begins anew behind the other, and any other fails by name. Note
-    the rebounds by the guard of the impact. Only a guard of multipliers may jump: forces do, where a load is switched
-    on, and its event happens at once.
+    A guard may jump below zero because another event changes something, as -v does in a rebound. This is not a
+    crossing. An event that is only recorded does not happen then, as in a run of SciPy's that starts anew after the
+    other event; any other makes the run fail with a message. To record rebounds, use the guard of the impact. Only a
+    guard of multipliers may jump, because forces do, for example when a load is switched on; its event then happens at
+    once.
 
-    The times of multipliers are those at which L is zero, between lines and what a part of the step gives: as exact as
-    the L that the run saves, of order 2; derivatives are those of the run, and of order 1.
+    For a guard of multipliers, L within a step is blended from linear interpolation and the values of a partial step.
+    Its time is as exact as the saved L, of order 2. Derivatives are those of the run, and of order 1.
 
-    Resting contact is no event: a ball that comes to rest on the floor bounces infinitely often in a finite time, and
-    the run fails by name when more than `max_events` fall into a step. Contacts that last are a `Contact` of the
-    system; in three dimensions a stiff force, or a constraint that an event switches on, and another one off where its
-    multiplier falls to zero: see `hhtjax.scenes.shaken_table`. A body at rest at its guard may start where its
-    acceleration takes it off.
+    Events do not model resting contact. A ball that comes to rest on the floor bounces infinitely often in a finite
+    time, and the run fails when more than `max_events` events fall into one step. For lasting contact use a `Contact`
+    of the system. In three dimensions use a stiff force, or a constraint that one event switches on and another
+    switches off when its multiplier falls to zero: see `hhtjax.scenes.shaken_table`. A body may start at rest at its
+    guard if its acceleration lifts it off.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind.
@@ -83,7 +86,7 @@ class Event(Description):
     >>> int(run.events.count), round(float(run.events.t[0]), 6)                # sqrt(2/9.81)
     (1, 0.451524)
 
-    A load that is switched on at a time, and the derivative of where a body is in that time, -F (1 - time)/m:
+    A load that is switched on at a given time, and the derivative of the final position in that time, -F (1 - time)/m:
 
     >>> import jax
     >>> body = hhtjax.System(mass=jnp.full(1, 2.0), force=lambda q, v, t, params: params["F"] + 0 * q)
@@ -112,7 +115,7 @@ class Event(Description):
         if self.reset is not None and not isinstance(self.reset, Impact):
             require_function("Event", "reset", self.reset, "reset(...)")
         if self.at is not None and isinstance(self.reset, Impact):
-            raise TypeError("Event: an impact needs the direction of a `guard`; received one with `at`.")
+            raise TypeError("Event: an impact needs the direction of a `guard`; received `at` without one.")
         if self.switch is not None:
             require_function("Event", "switch", self.switch, "switch(...)")
             if not any(_takes(self.switch, count) for count in SWITCHES):
@@ -125,21 +128,21 @@ class Event(Description):
 
     @property
     def is_noted(self) -> bool:
-        """Whether it changes nothing."""
+        """Whether it is only recorded and changes nothing."""
         return self.reset is None and self.switch is None and not self.terminal
 
     @property
     def sees_multipliers(self) -> bool:
-        """Whether its guard has an argument for them."""
+        """Whether its guard has an argument `multipliers`."""
         return self.guard is not None and "multipliers" in _parameters(self.guard)
 
     @property
     def switch_sees_state(self) -> bool:
-        """Whether its switch is one of the state too."""
+        """Whether its switch takes the state too."""
         return self.switch is not None and not _takes(self.switch, 1)
 
     def times(self, params: PyTree) -> Array:
-        """Those of `at`, (K,); NaN where they do not increase."""
+        """The times of `at`, (K,); NaN if they do not increase."""
         times = jnp.atleast_1d(as_float(self.at(params) if callable(self.at) else self.at))
         return jnp.where(jnp.all(times[1:] >= times[:-1]), times, jnp.nan)
 
@@ -148,7 +151,7 @@ SWITCHES = 1, 3, 4, 5  # how many arguments: params, and before it y, t of a fir
 
 
 def _required_times(at: PyTree):
-    """What `Event` takes as `at`, times by values as an array."""
+    """The argument `at` of an `Event`, checked; times given as values become an array."""
     if callable(at) and not is_array(at):
         require_function("Event", "at", at, "at(params)")
         return at
@@ -160,7 +163,7 @@ def _required_times(at: PyTree):
 
 
 def require_times(caller: str, times: np.ndarray):
-    """An error for times that are no numbers (K,), or do not increase; tracers pass."""
+    """Raises an error for times that are not numbers (K,) in increasing order; tracers pass."""
     if np.ndim(times) > 1 or not np.size(times):
         raise ValueError(f"{caller}: `at` must be a number, or of shape (K,); received the shape {np.shape(times)}.")
     if is_concrete(times):
@@ -171,7 +174,7 @@ def require_times(caller: str, times: np.ndarray):
 
 
 def _parameters(function: Callable):
-    """The names of its arguments; none where it does not tell."""
+    """The names of its arguments; an empty list if it has no signature."""
     try:
         return list(inspect.signature(function).parameters)
     except (TypeError, ValueError):
@@ -179,7 +182,7 @@ def _parameters(function: Callable):
 
 
 def _takes(function: Callable, count: int) -> bool:
-    """Whether it can be called with so many arguments; of one that does not tell, whether it is one."""
+    """Whether it can be called with `count` arguments; without a signature, whether count is 1."""
     try:
         inspect.signature(function).bind(*range(count))
     except (TypeError, ValueError) as error:
@@ -194,7 +197,7 @@ class Impact(Description):
     restitution: Any
 
     def coefficient(self, params: PyTree):
-        """e."""
+        """The coefficient of restitution e."""
         e = self.restitution
         if isinstance(e, str):
             return params[e]
@@ -206,13 +209,14 @@ def impact(restitution: Real | str = 1.0) -> Impact:
 
         v+ = v - (1 + e) M^-1 n (n.v + g_t)/(n.M^-1 n),    n = dg/dq
 
-    With constraints the impulse obeys them: M x = n + B^T L, B x = 0 in the place of M^-1 n. Internal states stay.
+    With constraints the impulse obeys them: x with M x = n + B^T L, B x = 0 replaces M^-1 n. Internal states do not
+    change.
 
     Args:
-        restitution: e in [0, 1]: a number, the name of one in params, or a function of params. 0 ends in a resting
-            contact, which is a failure that `check` names, unless something lifts the body off.
+        restitution: e in [0, 1]: a number, the name of a number in params, or a function of params. e = 0 ends in
+            resting contact, which is a failure that `check` reports unless something lifts the body off.
 
-    Returns: what `Event` takes as `reset`.
+    Returns: a value for the argument `reset` of `Event`.
     Raises: TypeError, ValueError: a restitution of a wrong kind, or outside [0, 1].
 
     References: F. Pfeiffer, C. Glocker, Multibody Dynamics with Unilateral Contacts, 1996.
@@ -249,11 +253,11 @@ class FlatEvents(NamedTuple):
 
     @property
     def still(self) -> FlatEvents:
-        """The same with times that are constant to derivatives."""
+        """As it is, but derivatives treat the times as constants."""
         return self._replace(times=lax.stop_gradient(self.times))
 
     def guards(self, s, params: PyTree, over: list) -> Array:
-        """g, (E,). over: of each event with known times, how many of them are over."""
+        """g, (E,). over: for each event with known times, how many of them have passed."""
         return self.values(s, params, next_times(self.times, over))
 
     def rates(self, system: FlatSystem, s, params: PyTree, over: list, Ldot=None):
@@ -269,16 +273,16 @@ class FlatEvents(NamedTuple):
         return jax.jvp(guards, at, along)
 
     def slope(self, s, s1, h: Array) -> Any:
-        """The rate of the multipliers between two states, where a guard sees them."""
+        """The rate of the multipliers between two states, if a guard uses multipliers."""
         return (s1.L - s.L) / jnp.where(h > 0, h, 1) if any(self.forced) else None
 
     def both(self, system: FlatSystem, s, s1, params: PyTree, over: list, h: Array):
-        """The same at both ends of a step."""
+        """The guards and their rates at both ends of a step."""
         Ldot = self.slope(s, s1, h)
         return [self.rates(system, x, params, over, Ldot) for x in (s, s1)]
 
     def before_any(self, t: Array):
-        """Of each event with times, how many of these are over at the start of a run."""
+        """For each event with known times, how many of them have passed before the run starts."""
 
         def passed(times: Array) -> Array:
             slack = SLOP * float(jnp.finfo(t.dtype).eps) * (jnp.abs(t) + jnp.abs(times))
@@ -287,25 +291,25 @@ class FlatEvents(NamedTuple):
         return [passed(times) for times in self.times if times is not None]
 
     def passed(self, i: Array, over: list):
-        """The same behind event i."""
+        """`over` after event i."""
         numbers = [number for number, here in enumerate(self.timed) if here]
         return [x + (i == number).astype(x.dtype) for number, x in zip(numbers, over, strict=True)]
 
     def due_after(self, t, over):
-        """The next of all known times that is more than a rounding after t; inf where there is none."""
+        """The next known time that is more than a rounding after t; inf if there is none."""
         later = t + SLOP * float(jnp.finfo(t.dtype).eps) * jnp.abs(t)
         due = [jnp.where(time > later, time, jnp.inf) for time in next_times(self.times, over)]
         return jnp.min(jnp.stack([jnp.full_like(t, jnp.inf), *due]))
 
 
 def next_times(times: tuple, over: list):
-    """When each of the events with times happens next; inf where it does not."""
+    """The next time of each event with known times; inf if none is left."""
     known = [x for x in times if x is not None]
     return [_first_left(x, passed) for x, passed in zip(known, over, strict=True)]
 
 
 def _first_left(times: Array, over: Array) -> Array:
-    """The first of the times (K,) that is not over; inf where all are."""
+    """The first of the times (K,) that has not passed; inf if all have."""
     last = len(times) - 1
     time = times[0] if last == 0 else lax.dynamic_index_in_dim(times, jnp.minimum(over, last), keepdims=False)
     return jnp.where(over > last, jnp.inf, time)
@@ -351,7 +355,7 @@ def flatten_events(system: FlatSystem, events: tuple, params: PyTree, at: tuple,
 
 
 def switched(system: FlatSystem, event: Event, q: Array, v: Array, t: Array, params: PyTree):
-    """The params behind an event, from the flat state before it."""
+    """The params after an event, from the flat state before it."""
     if event.switch is None:
         return params
     whole = event.switch_sees_state
@@ -374,7 +378,7 @@ def _on_vectors(system, function, q: Array, v: Array, t: Array, params: PyTree) 
 
 
 def _changed(system: FlatSystem, event: Event, params: PyTree, at: tuple):
-    """Numbers of the leaves of params that a switch changes."""
+    """The indices of the leaves of params that a switch changes."""
     leaves, structure = jax.tree.flatten(params)
     places = [i for i, x in enumerate(leaves) if is_array(x) or not callable(x)]
 
@@ -405,7 +409,7 @@ def _reset(system: FlatSystem, event, redundant, q: Array, v: Array, t: Array, p
 def _bounced(
     system: FlatSystem, guard: Callable, law: Impact, redundant, q: Array, v: Array, t: Array, params: PyTree
 ) -> Array:
-    """v behind an impact; NaN where no velocity changes the guard."""
+    """v after an impact; NaN if no velocity changes the guard."""
     e = jnp.asarray(law.coefficient(thaw(params))).astype(v.dtype)
     gradient, g_t = jax.grad(lambda q, t: jnp.asarray(guard(q, v, t, params)).reshape(()), argnums=(0, 1))(q, t)
     n = pull_back(system, q, gradient)

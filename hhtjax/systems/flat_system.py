@@ -1,4 +1,4 @@
-"""A system on vectors, as the steppers see it, and the checks of what its functions return."""
+"""A system on vectors, as the steppers use it, and the checks of what its functions return."""
 
 from __future__ import annotations
 
@@ -39,13 +39,14 @@ LARGEST_WITH_FRICTION = 600  # unknowns of a system of elements
 
 
 class FlatSystem(NamedTuple):
-    """A system on vectors, as the steppers see it; made by `flatten`.
+    """A system on vectors, as the steppers use it; made by `flatten`.
 
-    An internal state is a rate that has no position: v = (velocity, z) and w = (acceleration, zdot) hold N rates, of
-    which the first n have positions. Their force is (Q, g), and the mass of z is 1. A first-order system is the case
-    n = 0. q is (n,) too, but for rotations, of which it holds the matrices.
+    An internal state is a rate without a position: v = (velocity, z) and w = (acceleration, zdot) hold N rates, of
+    which the first n have positions. Their force is (Q, g), and the mass of z is 1. A first-order system is the case n
+    = 0. q is (n,) too, except for rotations, for which it holds the matrices.
 
-    params are everywhere as `freeze` leaves them, a pytree of arrays alone, which branches and loops can take. A user's
+    params are always in the form that `freeze` returns, a pytree of arrays only, which branches and loops can carry.
+    Before a user's function is called they are thawed to their original form.
     function gets them as the user gave them: whoever calls it thaws them.
     """
 
@@ -76,11 +77,11 @@ class FlatSystem(NamedTuple):
     told: Callable | None = None  # state, params -> the state with what is held as it is told
 
     def settled(self, params: PyTree) -> FlatSystem:
-        """What `settle` gives, where there is something to settle."""
+        """The system with the result of `settle`, if there is anything to settle."""
         return self if self.settle is None else self.settle(params)
 
     def without_sparse_solve(self) -> FlatSystem:
-        """The system whose steps are solved by full matrices, its mass among them."""
+        """The system with steps solved by full matrices, including its mass."""
         mass = self.mass
 
         def full(q: Array, t: Array, params: PyTree) -> Array:
@@ -90,7 +91,7 @@ class FlatSystem(NamedTuple):
         return self._replace(mass=full, sparse=None)
 
     def step_matrix(self, params: PyTree, w: Array, v: Array, q: Array):
-        """w M + v C + q K, `Sparse` or a diagonal (n,), of factors that are numbers."""
+        """w M + v C + q K, a `Sparse` or a diagonal (n,), for scalar factors."""
         known = self.matrices or self.diagonals
         assert known is not None
         terms = [(x, A) for x, A in zip((w, v, q), known(params), strict=True) if A is not None]
@@ -98,7 +99,7 @@ class FlatSystem(NamedTuple):
 
     @property
     def knows_matrices(self) -> bool:
-        """Whether `step_matrix` gives the matrix of a step, so that none has to be found column by column."""
+        """Whether `step_matrix` gives the matrix of a step, so that it need not be computed column by column."""
         return self.matrices is not None or self.diagonals is not None
 
     def inertia(self, q: Array, w: Array, t: Array, params: PyTree) -> Array:
@@ -110,7 +111,7 @@ class FlatSystem(NamedTuple):
         return self._of_positions(product, w)
 
     def residual(self, q: Array, v: Array, w: Array, t: Array, params: PyTree) -> Array:
-        """M(q, t) w - Q(q, v, t), and zdot - g: zero on the trajectory, but for the reactions of constraints."""
+        """M(q, t) w - Q(q, v, t), and zdot - g: zero along the motion, apart from the reactions of constraints."""
         if self.balance is not None:
             return self.balance(q, v, w, t, params)
         return self.inertia(q, w, t, params) - self.force(q, v, t, params)
@@ -121,7 +122,7 @@ class FlatSystem(NamedTuple):
         return self.mass_solver(M, factorize)(Q)
 
     def mass_solver(self, M: Array, factorize: Callable = factorize):
-        """The function Q -> M^-1 Q, and what works on z as it is; factorised once."""
+        """The function Q -> M^-1 Q, which leaves entries for z unchanged; factorised once."""
         if self.massless is not None:
             return partial(self._of_positions, partial(matvec, jnp.asarray(self.massless).astype(M.dtype)))
         if self.factors is not None and self.factors.mass is not None:
@@ -135,7 +136,7 @@ class FlatSystem(NamedTuple):
         return partial(self._of_positions, inverse)
 
     def with_ones(self, d: Array) -> Array:
-        """d (n,), of M, and ones for z: (N,)."""
+        """d (n,), the diagonal of M, and ones for z: (N,)."""
         return d if self.positions == self.size else jnp.concatenate([d, jnp.ones(self.size - self.positions, d.dtype)])
 
     def full_mass(self, q: Array, t: Array, params: PyTree) -> Array:
@@ -147,16 +148,16 @@ class FlatSystem(NamedTuple):
         return M if self.positions == self.size else block_diag(M, jnp.eye(self.size - self.positions, dtype=M.dtype))
 
     def located(self, x: Array) -> Array:
-        """Those entries of a vector (N,) of rates that have positions."""
+        """The entries of a vector (N,) of rates that have positions."""
         return x if self.positions == self.size else x[: self.positions]
 
     def with_internal(self, x: Array, z: Array):
-        """x, but beside positions the entries of internal states as in z: (N,)."""
+        """x, with the entries of internal states taken from z: (N,)."""
         n = self.positions
         return x if n in (0, self.size) else jnp.concatenate([x[:n], z[n:]])
 
     def widened(self, D: Array) -> Array:
-        """A derivative (N, n) in q as one in displacements (N,), of which those of z move nothing."""
+        """A derivative (N, n) with respect to q as one with respect to displacements (N,), zero for entries of z."""
         return D if self.positions == self.size else jnp.pad(D, ((0, 0), (0, self.size - self.positions)))
 
     def move(self, q: Array, x: Array) -> Array:
@@ -168,29 +169,30 @@ class FlatSystem(NamedTuple):
         return kinematics.rate(self.blocks, q, self._freed(self.located(v)))
 
     def _freed(self, x: Array) -> Array:
-        """x with 0 for what stays, which no reaction of a constraint moves."""
+        """x with 0 for held coordinates, which reactions of constraints do not move."""
         return x if self.stays is None else jnp.where(self.stays, 0, x)
 
     def end_of_chart(self, x: Array, *rates: Array):
-        """Velocity, acceleration, algorithmic acceleration, from first and second rates of the displacement x."""
+        """Velocity, acceleration and algorithmic acceleration, from first and second rates of the displacement x."""
         if not self.blocks:
             return rates
         ends = kinematics.end_of_chart(self.blocks, *map(self.located, (x, *rates)))
         return tuple(map(self.with_internal, ends, rates))
 
     def in_chart(self, x: Array, v: Array, w: Array) -> Array:
-        """The second rate of the displacement x, whose first is v, of an acceleration w."""
+        """The second rate of the displacement x, given its first rate v and the acceleration w."""
         if not self.blocks:
             return w
         return self.with_internal(kinematics.in_chart(self.blocks, *map(self.located, (x, v, w))), w)
 
     def tidy(self, state):
-        """The state at the end of a step: what is held as it is told, and rotations orthogonal to rounding."""
+        """The state at the end of a step, with held nodes at their prescribed positions, and rotations orthogonal to
+        rounding."""
         state = state if self.told is None else self.told(state)
         return state._replace(q=kinematics.orthonormalize(self.blocks, state.q))
 
     def _of_positions(self, f: Callable, x: Array) -> Array:
-        """f of the entries that have positions, the others as they are."""
+        """f applied to the entries that have positions; the others unchanged."""
         n = self.positions
         if n == self.size:
             return f(x)
@@ -198,8 +200,8 @@ class FlatSystem(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """Of a linear system of constant matrices, by `panels.lu`: of M (None of a diagonal), of the matrices of the start
-    and of the step."""
+    """The LU factors of a linear system of constant matrices, by `panels.lu`: of M (None if diagonal), and of the
+    matrices of the start and of the step."""
 
     mass: Any
     start: Any
@@ -207,7 +209,7 @@ class Factors(NamedTuple):
 
 
 class Local(NamedTuple):
-    """A nonlinear force beside a linear system."""
+    """The nonlinear force of a linear system."""
 
     linear: FlatSystem  # without it
     force: Callable  # q, v, t, params -> (k,), or (n,)
@@ -216,9 +218,9 @@ class Local(NamedTuple):
 
 
 def flatten(caller: str, system, q0: PyTree, v0: PyTree, t0: Real, params: PyTree, z0: PyTree = None):
-    """The system on vectors, and q0 and (v0, z0) as vectors: the one place where pytrees are ravelled.
+    """The system on vectors, and q0 and (v0, z0) as vectors. This is the only place where pytrees are ravelled.
 
-    Runs while tracing, so it checks shapes and structures and costs nothing at run time.
+    It runs while tracing, so its checks of shapes and structures cost nothing at run time.
     """
     with telling_of_arguments(caller, q0, v0, params):
         if isinstance(system, FirstOrderSystem):
@@ -233,8 +235,8 @@ def _flatten_second_order(caller: str, system, q0: PyTree, v0: PyTree, t0: Real,
     n, blocks = v.size, kinematics.layout(q0, v0)
     if blocks and (isinstance(system, LinearSystem) or getattr(system.mass, "is_lagrangian", False)):
         raise NotImplementedError(
-            f"{caller}: rotations in `q0` need a System(mass, force): they are no linear coordinates, and "
-            "from_lagrangian knows no others."
+            f"{caller}: `from_lagrangian` does not support rotations in `q0`, because they are not linear coordinates: "
+            "write a System(mass, force)."
         )
     constraint, m = None, 0
     if system.constraint is not None:
@@ -275,7 +277,7 @@ def _flatten_second_order(caller: str, system, q0: PyTree, v0: PyTree, t0: Real,
 def _with_elements(
     caller: str, system: System, flat: FlatSystem, q0: PyTree, v0: PyTree, t0: Real, params: PyTree
 ) -> FlatSystem:
-    """The system with the solve that follows from where its elements are, and with what is held."""
+    """The system with the solve that its elements allow, and with its held nodes."""
     force, constraint = system.force, system.constraint
     assert isinstance(force, ElementForce)
     like = jax.eval_shape(lambda *x: jax.tree.map(jnp.asarray, x), q0, v0, t0, params)
@@ -311,13 +313,13 @@ def _with_elements(
 
 
 def _told(held: Held | None, flat: FlatSystem, params: PyTree, state):
-    """A state with positions and velocities as they are told."""
+    """A state with the positions and velocities of held nodes as prescribed."""
     q, v = at(held, flat.unravel(state.q), flat.unravel_rates(state.v), state.t, params)
     return state._replace(q=ravel_pytree(q)[0], v=ravel_pytree(v)[0])
 
 
 def _with_dynamics(caller: str, system, flat: FlatSystem, dtype, q0: PyTree, v0: PyTree, t0: Real, params, z0: PyTree):
-    """The system with its residual as one function, and M w and M by it."""
+    """The system with its residual as one function, from which M w and M follow."""
     z = () if system.internal is None else (z0,)
     r = evaluate(caller, "dynamics", system.dynamics, q0, v0, v0, *z, t0, params)
     check_like(caller, "dynamics", r, "v0", v0, dtype)
@@ -362,7 +364,7 @@ def _flat_force(
 
 
 def _with_local(system, flat: FlatSystem, dtype: np.dtype) -> FlatSystem:
-    """The system with its nonlinear force kept apart, too."""
+    """The system with its nonlinear force also available separately."""
 
     def linear_force(q: Array, v: Array, t: Array, params: PyTree) -> Array:
         Q = system.linear_force(flat.unravel(q), flat.unravel_rates(v), t, thaw(params))
@@ -377,7 +379,7 @@ def _with_local(system, flat: FlatSystem, dtype: np.dtype) -> FlatSystem:
 
 
 def _with_internal(system, flat: FlatSystem, q: Array, v0: PyTree, z0: PyTree):
-    """The same with internal states, behind the velocities and their rates."""
+    """The system with internal states, which follow the velocities and their rates."""
     V, unravel = ravel_pytree((v0, z0))
     unravel_internal = ravel_pytree(z0)[1]
 
@@ -395,7 +397,7 @@ def _with_internal(system, flat: FlatSystem, q: Array, v0: PyTree, z0: PyTree):
 
 
 def _flatten_first_order(caller: str, system: FirstOrderSystem, y0: PyTree, t0: Real, params: PyTree):
-    """y' = rate: internal states alone, without a position."""
+    """The system y' = rate: only internal states, without positions."""
     y, unravel = ravel_pytree(y0)
     n, dtype = y.size, y.dtype
     check_like(caller, "rate", evaluate(caller, "rate", system.rate, y0, t0, params), "q0", y0, dtype)
@@ -421,7 +423,7 @@ def _check_functions(
     params: PyTree,
     z0: PyTree,
 ):
-    """Shapes of what the functions of a system return."""
+    """Checks the shapes of what the functions of a system return."""
     if linear:
         for name in ("M", "C", "K"):
             matrix = getattr(system, name)
@@ -450,7 +452,7 @@ def _check_functions(
 
 
 def _check_nonlinear(caller: str, system, n: int, dtype: np.dtype, q0: PyTree, v0: PyTree, t0: Array, params: PyTree):
-    """The force beside a linear system."""
+    """The nonlinear force of a linear system."""
     if system.at is None:
         like = "v0", v0
     elif max(system.at) >= n:

@@ -1,4 +1,4 @@
-"""Dry friction of a system: where it acts, how large it may become, and what it does to the accelerations.
+"""Dry friction of a system: where it acts, its limits, and its effect on the accelerations.
 
     s = sliding(q, v, t),    H = ds/dv,    F = limit(q, v, t) >= 0
     M(q) w = Q(q, v, t) + B^T L - H^T tau,    tau = F sign(s) if s != 0, else |tau| <= F
@@ -40,7 +40,7 @@ class FrictionLaw(NamedTuple):
 
 
 def require_friction(caller: str, friction: Callable | None, sliding: Callable | None, *more: str):
-    """An error for what are no functions of dry friction. more: what `friction` takes between v and t."""
+    """Raises an error for wrong functions of dry friction. more: the arguments of `friction` between v and t."""
     if friction is None:
         if sliding is not None:
             raise ValueError(f"{caller}: `sliding` must go with `friction`, the limits of the forces there.")
@@ -53,7 +53,7 @@ def require_friction(caller: str, friction: Callable | None, sliding: Callable |
 def flat_friction(
     caller: str, system, flat, q0: PyTree, v0: PyTree, z0: PyTree, t0: Real, params: PyTree
 ) -> FrictionLaw:
-    """The `FrictionLaw` of a system, or an error for what its functions return."""
+    """The `FrictionLaw` of a system; raises an error if its functions return wrong shapes."""
     dtype, n = ravel_pytree(q0)[0].dtype, flat.positions
     z = () if z0 is None else (z0,)
     L = (jnp.zeros(flat.num_constraints, dtype),) if flat.num_constraints else ()
@@ -64,7 +64,7 @@ def flat_friction(
         if m > MOST:
             raise ValueError(
                 f"{caller}: `friction` acts on at most {MOST} directions; received one for each of {n} coordinates: "
-                "give `sliding`, the sliding velocities of those that rub."
+                "give `sliding`, the sliding velocities of those with friction."
             )
     else:
         m = checks.count(caller, "sliding", system.sliding, MOST, dtype, q0, v0, t0, params)
@@ -91,7 +91,7 @@ def flat_friction(
 
 
 def directions(system, q, t, params: PyTree) -> Array:
-    """H (m, N), the derivative of the sliding velocities in the rates."""
+    """H (m, N), the derivative of the sliding velocities with respect to the rates."""
     zero = jnp.zeros(system.size, q.dtype)
     s = partial(system.friction.sliding, q, t=t, params=params)
     return linear_map(jax.linearize(s, zero)[1], zero)
@@ -104,7 +104,7 @@ def reaction(system, q, t, params: PyTree, tau) -> Array:
 
 
 def own_rate(system, q, v, t, params):
-    """The part of ds/dt that w does not enter: (m,)."""
+    """The part of ds/dt that does not depend on w: (m,)."""
 
     def s(q, t):
         return system.friction.sliding(q, v, t, params)
@@ -113,23 +113,23 @@ def own_rate(system, q, v, t, params):
 
 
 def responses(answer: Callable, H: Array):
-    """G (m, N), the accelerations that a unit of force in each direction of H makes, M^-1 H^T, with constraints; and
-    the multipliers that belong to them. answer: of `answers`."""
+    """G = M^-1 H^T (m, N), the accelerations for a unit of force in each direction of H, including constraints; and the
+    multipliers for it. answer: of `answers`."""
     return jax.vmap(answer)(H)
 
 
 def across(H: Array, G: Array):
-    """H G^T (m, m): what a unit of force in direction j does in direction i."""
+    """K = H G^T (m, m): K_ij is the acceleration in direction i for a unit of force in direction j."""
     return jnp.stack([matvec(H, g) for g in G], axis=1)
 
 
 def solve_some(K: Array, some: Array, b: Array) -> Array:
-    """y with K y = b on those rows and columns, and 0 elsewhere."""
+    """y with K y = b on these rows and columns, and 0 elsewhere."""
     return solver_of_some(K, some)(b)
 
 
 def solver_of_some(K: Array, some: Array):
-    """The function b -> y of it, for many b: factorised once."""
+    """The function b -> y for many b, factorised once."""
     if len(K) == 1:
         return lambda b: jnp.where(some, b, 0) / jnp.where(some, K[0], 1)
     solve = solver(block_of(K, some))
@@ -137,15 +137,17 @@ def solver_of_some(K: Array, some: Array):
 
 
 def block_of(A: Array, some: Array) -> Array:
-    """A on those rows and columns, beside ones."""
+    """A on these rows and columns, the identity elsewhere."""
     return jnp.where(some[:, None] & some[None, :], A, jnp.eye(len(A), dtype=A.dtype))
 
 
 def at_rest(K: Array, rests: Array, load: Array, f: Array):
-    """sig and tau of joints at rest: what holds them against their loads, within their limits; the others slide.
+    """sig and tau of joints at rest: those that can be held against their loads within their limits are; the others
+    slide.
 
-    From all of them held on, the first joint of which that is wrong changes: it cannot be held, and slides, or its
-    friction would drive it, and it is held. So no choice comes twice (Murty 1974: K is positive).
+    At first all are held. Then, one at a time, the first joint with a wrong state changes it: a held joint that exceeds
+    its limit slides, and a sliding joint that its friction would accelerate is held. No choice comes twice (Murty 1974:
+    K is positive).
     """
     if len(f) == 1:
         tau = jnp.clip(load / K[0], -f, f)
@@ -167,13 +169,13 @@ def at_rest(K: Array, rests: Array, load: Array, f: Array):
 
 
 def _holding(K: Array, load: Array, f: Array, rests: Array, sig: Array) -> Array:
-    """tau of joints that slide in the directions sig, and of the others at rest, which it holds."""
+    """tau of joints that slide in the directions sig, and of the others, which are held at rest."""
     slid = sig * f
     return slid + solve_some(K, rests & (sig == 0), load - matvec(K, slid))
 
 
 def _wrong(K: Array, load: Array, f: Array, rests: Array, sig: Array):
-    """What joints at rest should do instead, and which of them, but for roundings, must."""
+    """The state that each joint at rest should change to, and for which joints this is more than a rounding."""
     tau, alone = _holding(K, load, f, rests, sig), diagonal(K)
     over = jnp.where(sig == 0, jnp.abs(tau) - f, sig * (matvec(K, tau) - load) / alone)
     noise = ROUNDING * float(jnp.finfo(f.dtype).eps) * (jnp.abs(load) + matvec(jnp.abs(K), f)) / alone

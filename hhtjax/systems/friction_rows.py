@@ -1,13 +1,13 @@
-"""Directions of friction that may depend on each other, or on constraints, and what joints at rest there do.
+"""Directions of friction that may depend on each other or on constraints, and the forces of joints at rest there.
 
-In a closed loop more joints may rub than there are freedoms: K = H A^-1 H^T is singular. The forces are then not
+In a closed loop more joints may have friction than there are freedoms: K = H A^-1 H^T is singular. The motion is then
+unique, but the forces are not. Joints at rest, with the accelerations `load` without friction, solve
 unique, and the motion is: of joints at rest, with the accelerations `load` without friction,
 
     min tau' K tau/2 - load' tau,    |tau_i| <= F_i,    ds/dt = load - K tau
 
-Every minimiser gives the same ds/dt. Of all of them the one with the least sum of K_ii tau_i^2 is taken. Where the
-motion of a joint is prescribed, as in a mechanism with a driven crank, K_ii = 0: its friction moves nothing, and acts
-on the multipliers alone.
+Every minimiser gives the same ds/dt. The one with the least sum of K_ii tau_i^2 is taken. If the motion of a joint is
+prescribed, as in a mechanism with a driven crank, K_ii = 0: its friction changes no motion, only the multipliers.
 
 D. Bertsekas, SIAM J. Control Optim. 20, 1982; J. Moreau, Unilateral contact and dry friction in finite freedom
 dynamics, 1988.
@@ -39,12 +39,12 @@ HALVINGS = 16  # of a Newton step
 
 
 class Independent(NamedTuple):
-    """Rows that do not depend on each other: every choice of them is solved as it is."""
+    """Independent rows: every choice of them is solved directly."""
 
     K: Array
 
     def solve(self, A: Array, some: Array, b: Array):
-        """y with A y = b on those rows and columns, 0 elsewhere."""
+        """y with A y = b on these rows and columns, 0 elsewhere."""
         return solver_of_some(A, some)(b)
 
     def at_rest(self, rests: Array, load: Array, f: Array, size: Array | None = None):
@@ -52,7 +52,7 @@ class Independent(NamedTuple):
         return at_rest(self.K, rests, load, f)
 
     def are_dependent(self) -> Array:
-        """Whether they depend on each other after all."""
+        """Whether they turn out to depend on each other."""
         left, least, m = lax.stop_gradient(self.K), _rounding(self.K), len(self.K)
         found = jnp.zeros((), bool)
         for i in range(m - 1):  # what is left of a diagonal, without those before it
@@ -61,15 +61,15 @@ class Independent(NamedTuple):
         return found
 
     def carriers(self, some: Array) -> Array:
-        """The same rows."""
+        """The rows, unchanged."""
         return some
 
 
 class Dependent(NamedTuple):
-    """Rows that may depend on each other, on those of a basis: s_j = sum C_ij s_i.
+    """Rows that may depend on each other, expressed by the rows of a basis: s_j = sum C_ij s_i.
 
-    K: what a unit of force in direction j does in direction i; of dependent rows that of the basis, so that it is of
-    the rank that it should have. least: what is rounding in its diagonal.
+    K_ij: the acceleration in direction i for a unit of force in direction j. For dependent rows it is computed from the
+    basis, so that it has the correct rank. least: what counts as rounding in its diagonal.
     """
 
     K: Array
@@ -78,34 +78,34 @@ class Dependent(NamedTuple):
     least: Array
 
     def spanning(self, some: Array, first: bool = False) -> Array:
-        """As many of those rows as do not depend on each other; from `first`, while there are such."""
+        """A largest set of independent rows among these; rows of `first` are preferred."""
         return independent(self.K, self.least, some, first)
 
     def solve(self, A: Array, some: Array, b: Array):
-        """y with A y = b on as many of those rows and columns as are independent, 0 elsewhere."""
+        """y with A y = b on a largest independent set of these rows and columns, 0 elsewhere."""
         return solver_of_positive(A, self.spanning(some))(b)
 
     def at_rest(self, rests: Array, load: Array, f: Array, size: Real = 0.0):
-        """sig and tau of joints at rest, from their loads, which are made of terms of this size."""
+        """sig and tau of joints at rest, from their loads; `size` is the size of the terms in these."""
         return at_rest_in_box(self, rests, load, f, size)
 
     def are_dependent(self) -> bool:
-        """That is known of them."""
+        """True: their dependence is already known."""
         return False
 
     def carriers(self, some: Array) -> Array:
-        """The rows of the basis that some rows are made of."""
+        """The rows of the basis in terms of which these rows are expressed."""
         return self.basis & jnp.any(some[None, :] & (self.C != 0), axis=1)
 
     def shared(self, sticks: Array, tau: Array, f: Array) -> Array:
-        """tau, where joints stick in other forces that do the same, within the limits."""
+        """tau, with the forces of sticking joints replaced by equivalent ones within the limits."""
         held = jnp.where(sticks, tau, 0)
         _, shared = self.at_rest(sticks, matvec(self.K, held), f, matvec(jnp.abs(self.K), jnp.abs(held)))
         return jnp.where(sticks, shared, tau)
 
 
 def depends(system, redundant) -> bool:
-    """Whether directions may depend on each other: as is known of the system, or as `redundant` of the stepper says."""
+    """Whether directions may depend on each other, which the system or the option `redundant` of the stepper says."""
     return system.friction.dependent or redundant is not None
 
 
@@ -120,9 +120,9 @@ def rows_of(
     first: Real,
     dependent: bool,
 ):
-    """The rows of H, with G = A^-1 H^T and the multipliers that belong to it. first: those that a basis begins with.
+    """The rows of H, with G = A^-1 H^T and the multipliers for it. first: rows with which a basis begins.
 
-    dependent: whether they may depend on each other; where not, they cost nothing.
+    dependent: whether they may depend on each other; independent rows cost nothing extra.
     """
     K = jnp.stack([matvec(H, g) for g in G], axis=1)
     if not dependent:
@@ -139,12 +139,12 @@ def rows_of(
 
 
 def _rounding(K: Array) -> Array:
-    """What is rounding in the diagonal of K: in single precision more."""
+    """What counts as rounding in the diagonal of K; more in single precision."""
     return max(LIMIT, 1e3 * float(jnp.finfo(K.dtype).eps)) * jnp.abs(diagonal(K))
 
 
 def slight(dtype: np.dtype) -> float:
-    """The same of SLIGHT."""
+    """SLIGHT, but not less than rounding in this dtype."""
     return max(SLIGHT, 1e3 * float(jnp.finfo(dtype).eps))
 
 
@@ -155,7 +155,7 @@ def _through(C: Array, basis: Array, K: Array) -> Array:
 
 
 def _left_by_constraints(H: Array, pulls, B: Array) -> Array:
-    """Which part of each row constraints leave to move something: at most 1, and more than 0."""
+    """The part of the mobility of each row that constraints leave: at most 1, and more than 0."""
     left, taken = jnp.abs(H + pulls @ B), jnp.abs(H) + jnp.abs(pulls) @ jnp.abs(B)
     unit = jnp.maximum(jnp.max(jnp.abs(H), axis=0), jnp.max(jnp.abs(B), axis=0))  # of each coordinate
     left, taken = (jnp.max(x / jnp.where(unit == 0, 1, unit)[None, :], axis=1) for x in (left, taken))
@@ -163,7 +163,7 @@ def _left_by_constraints(H: Array, pulls, B: Array) -> Array:
 
 
 def solver_of_positive(A: Array, some: Array):
-    """b -> y with A y = b on those rows and columns, 0 elsewhere, of an A that is positive there."""
+    """b -> y with A y = b on these rows and columns, 0 elsewhere, for an A that is positive there."""
 
     def factorize(A):
         inverse = _inverse(lax.stop_gradient(A))
@@ -174,7 +174,7 @@ def solver_of_positive(A: Array, some: Array):
 
 
 def _inverse(A: Array) -> Array:
-    """Of a positive A, which needs no other pivots, by as short a program as can be."""
+    """The solution for a positive A, which needs no pivoting, by a program that is as short as possible."""
     i = jnp.arange(len(A))
 
     def exchange(k: Array, X: Array) -> Array:
@@ -187,9 +187,9 @@ def _inverse(A: Array) -> Array:
 
 
 def independent(K: Array, least: Array, some: Array, first: Real = False) -> Array:
-    """A largest choice of `some` of the rows of a semi-definite K that do not depend on each other.
+    """A largest independent set of `some` of the rows of a semi-definite K.
 
-    By elimination with diagonal pivots, the largest next; those of `first` before others.
+    By elimination with diagonal pivots, the largest next; rows of `first` come before others.
     """
     K, m = lax.stop_gradient(K), len(K)
     before = jnp.where(jnp.broadcast_to(first, (m,)), 1 / float(jnp.finfo(K.dtype).eps), 1).astype(K.dtype)
@@ -210,9 +210,9 @@ def independent(K: Array, least: Array, some: Array, first: Real = False) -> Arr
 
 
 def is_prescribed(system, rows, pulls: Array, states: tuple, params: PyTree) -> Array:
-    """Whether a sliding velocity has a part that the basis has no say in, at one of two states: (m,).
+    """Whether a sliding velocity has a part that the basis does not determine, at one of two states: (m,).
 
-    That is r = own - C^T own + (L - C^T L) dPhi/dt in s_j = sum C_ij s_i + r_j, where H^T - H^T C = -B^T L.
+    This part is r = own - C^T own + (L - C^T L) dPhi/dt in s_j = sum C_ij s_i + r_j, where H^T - H^T C = -B^T L.
     """
     zero, C = jnp.zeros(system.size, pulls.dtype), rows.C.T
     found = jnp.zeros(len(C), bool)
@@ -228,9 +228,9 @@ def is_prescribed(system, rows, pulls: Array, states: tuple, params: PyTree) -> 
 
 
 def at_rest_in_box(rows: Dependent, rests: Array, load: Array, f: Array, size: Real = 0.0):
-    """sig and tau of joints at rest: what holds them, within their limits; those slide that this leaves accelerated.
+    """sig and tau of joints at rest: they are held within their limits; those that are still accelerated slide.
 
-    Derivatives are those of the smallest forces tau that hold what sticks, beside those at their limits.
+    Derivatives are those of the smallest forces tau that hold the sticking joints, given the forces at their limits.
     """
     K = rows.K
     sig, found = slides_in_box(K, rows.least, rests, load, f, size)
@@ -249,7 +249,8 @@ def at_rest_in_box(rows: Dependent, rests: Array, load: Array, f: Array, size: R
 
 
 def slides_in_box(K: Array, least: Array, rests: Array, load: Array, f: Array, size: Real = 0.0):
-    """The directions of those joints at rest that cannot be held, and the forces; both without derivatives."""
+    """The directions in which joints at rest that cannot be held start to slide, and the forces; both without
+    derivatives."""
     K, load, f, size = lax.stop_gradient((K, load, f, jnp.asarray(size, K.dtype)))
     rests = jnp.broadcast_to(rests, f.shape)
     moved = rests & (diagonal(K) > least)
@@ -262,13 +263,14 @@ def slides_in_box(K: Array, least: Array, rests: Array, load: Array, f: Array, s
 
 
 def leaves_box(K: Array, least: Array, rests: Array, loads: list, f: Array, size: Real = 0.0):
-    """When loads that go linearly from one to the other of two, within a unit of time, leave what joints at rest can
-    hold for good, and who slides then, and where to; infinity and nobody where they do not.
+    """The time at which loads that change linearly from one value to another, within a unit of time, permanently exceed
+    what joints at rest can hold; and which joints slide then, in which directions. Infinity and none if this does not
+    happen.
 
-    The held loads are a convex set, {K tau, |tau| <= F}. Where the load at x is not in it, with the forces tau and the
-    acceleration r = load - K tau = K u of the box problem, a plane separates the two: u.load <= r.tau holds in the set.
-    The line crosses that plane nearer to the set: Newton's iteration on a convex distance, from the outside. Of the
-    derivative u has no part, as of all planes the one that is crossed first tells the time.
+    The loads that can be held are a convex set, {K tau, |tau| <= F}. If the load at x is outside, with the forces tau
+    and the acceleration r = load - K tau = K u of the box problem, a plane separates it from the set: u.load <= r.tau
+    holds in the set. The line crosses this plane nearer to the set. This is Newton's iteration on a convex distance,
+    from the outside. u is not differentiated, because the plane that is crossed first determines the time.
     """
     known = lax.stop_gradient((K, loads, f))
     moved = rests & (diagonal(known[0]) > least)
@@ -305,10 +307,11 @@ def leaves_box(K: Array, least: Array, rests: Array, loads: list, f: Array, size
 
 
 def smallest_in_box(K: Array, load: Array, f: Array, moved: Array) -> Array:
-    """tau with min tau' K tau/2 - load' tau, |tau| <= f, for a semi-definite K: by Newton's iteration on what no bound
-    holds, projected (Bertsekas 1982), with a proximal term: from 0, so that of all minima the smallest is found.
+    """tau with min tau' K tau/2 - load' tau, |tau| <= f, for a semi-definite K: projected Newton iteration on the
+    variables that are not at a bound (Bertsekas 1982), with a proximal term. It starts from 0, so it finds the smallest
+    of all minimisers.
 
-    In units in which the diagonal of K is 1.
+    Units are such that the diagonal of K is 1.
     """
     m, alone = len(f), diagonal(K)
     unit = jnp.sqrt(jnp.where(moved, alone, 1))
@@ -353,9 +356,9 @@ def smallest_in_box(K: Array, load: Array, f: Array, moved: Array) -> Array:
 
 
 def held_back(system, s, L, old, new, dw: Array, answer, dependent: bool):
-    """A jump dw of the accelerations at a state, as params jump and multipliers become L, with what friction does about
-    it: of joints at rest, and of those that slide, whose limits may jump too; and the multipliers. answer: of `answers`
-    there; dependent: whether directions may depend on each other."""
+    """A jump dw of the accelerations at a state, when params jump and multipliers become L, with the reaction of
+    friction: of joints at rest, and of sliding joints, whose limits may jump too. Also returns the multipliers. answer:
+    of `answers` there; dependent: whether directions may depend on each other."""
     H, (sig, tau) = directions(system, s.q, s.t, new), s.friction
     rests = sig == 0
     G, pulls = responses(answer, H)

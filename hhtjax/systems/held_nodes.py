@@ -1,7 +1,7 @@
-"""Nodes of a system of elements that stay where they start, or move as they are told.
+"""Nodes of a system of elements that are held at their start, or move in a prescribed way.
 
-The acceleration of what is held is known, w = a(t), and takes the place of its row of the equations. Elements and
-joints see its position and velocity as they are told, so that no error of a step adds up there.
+The acceleration of a held coordinate is known, w = a(t), and this equation replaces its row. Elements and joints see
+its prescribed position and velocity, so that errors of steps do not accumulate there.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ AGREES = 1e-6  # difference, relative to the size of a state, of a start from wh
 
 @dataclass(frozen=True)
 class Still:
-    """What stays: True for all of a node, or booleans structured like it, as the repr of a pytree of tuples."""
+    """What is held at its start: True for the whole node, or booleans structured like it, as the repr of a pytree of
+    tuples."""
 
     which: Any
 
     def __call__(self, *_):
-        raise TypeError("what stays where it starts is no function of the time")
+        raise TypeError("a node that is held at its start is not a function of time")
 
 
 @dataclass(frozen=True)
 class Held:
-    """Some nodes, how they are held (`Still`, or a function of t and params), and the `Held` of others."""
+    """Some nodes, how they are held (`Still`, or a function of t and params), and the `Held` of other nodes."""
 
     nodes: tuple
     alone: bool  # whether `nodes` was a number: leaves then have no axis for it
@@ -44,10 +45,10 @@ class Held:
     rest: Any = None
 
     def __call__(self, *_):
-        raise TypeError("a description of nodes is no function")
+        raise TypeError("a description of nodes is not a function")
 
     def all(self):
-        """Each in turn."""
+        """Iterates over the groups of nodes."""
         here = self
         while here is not None:
             yield here
@@ -55,11 +56,11 @@ class Held:
 
     @property
     def moves(self) -> bool:
-        """Whether some of them move."""
+        """Whether some of them are moved."""
         return any(not isinstance(x.how, Still) for x in self.all())
 
     def told(self, v: PyTree, t: Real, params: PyTree):
-        """Position, velocity and acceleration of these nodes, as far as the function gives them."""
+        """Position, velocity and acceleration of these nodes, for the components that the function prescribes."""
         t = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(v)))
         one = jnp.ones_like(t)
 
@@ -74,14 +75,14 @@ class Held:
         return position(t), v_told, w_told
 
     def here(self, tree: PyTree, part: PyTree = None) -> PyTree:
-        """The leaves of these nodes; where a part is a dict, other sets of nodes need not have them."""
+        """The leaves of these nodes; if a part is a dict, other sets of nodes need not have them."""
         places = self.nodes[0] if self.alone else np.array(self.nodes)
         if isinstance(tree, dict) and isinstance(part, dict):
             tree = {key: x for key, x in tree.items() if key in part or all(map(self._fit, jax.tree.leaves(x)))}
         for x in jax.tree.leaves(tree):
             if not self._fit(x):
                 raise ValueError(
-                    f"System.from_elements: `held` names node {max(self.nodes)}, and a leaf of the state has shape "
+                    f"System.from_elements: `held` names node {max(self.nodes)}, but a leaf of the state has shape "
                     f"{jnp.shape(x)}: nodes are counted from 0."
                 )
         return jax.tree.map(lambda x: x[places], tree)
@@ -100,7 +101,7 @@ class Held:
             here = np.shape(places) + x.shape[1:]
             if jnp.shape(part) != here:
                 raise ValueError(
-                    f"System.from_elements: what `held` gives of {self.nodes} must have their shape {here}; "
+                    f"System.from_elements: the result of `held` for {self.nodes} must have their shape {here}; "
                     f"received shape {jnp.shape(part)}."
                 )
             return x.at[places].set(part)
@@ -109,7 +110,7 @@ class Held:
 
 
 def _rate(q: Array, qdot: Array, v: Array) -> Array:
-    """The velocity of a leaf of nodes: its rate, or vee(R^T Rdot)."""
+    """The velocity of a leaf of nodes: its time derivative, or vee(R^T Rdot)."""
     if not is_rotation(q.shape, v.shape):
         return qdot
     vee = jnp.vectorize(lambda R, Rdot: rotation.vee(R.T @ Rdot), signature="(i,j),(i,j)->(i)")
@@ -117,13 +118,13 @@ def _rate(q: Array, qdot: Array, v: Array) -> Array:
 
 
 def _paired(f: Callable, part: PyTree, *trees: PyTree, whole: bool = False) -> PyTree:
-    """f on the leaves of a part and of pytrees; a part of a dict may leave keys out, which then get None (whole), or
-    are left out."""
+    """f on the leaves of a part and of pytrees. A dict as a part may omit keys; their leaves get None (whole), or are
+    left out."""
     if not isinstance(trees[-1], dict):
         return jax.tree.map(f, part, *trees)
     if not isinstance(part, dict) or set(part) - set(trees[-1]):
         raise ValueError(
-            f"System.from_elements: what `held` gives must be a dict with some of the keys {sorted(trees[-1])}; "
+            f"System.from_elements: the result of `held` must be a dict with some of the keys {sorted(trees[-1])}; "
             f"received {part!r}."
         )
     found = {}
@@ -136,7 +137,8 @@ def _paired(f: Callable, part: PyTree, *trees: PyTree, whole: bool = False) -> P
 
 
 def at(held: Held | None, q: PyTree, v: PyTree | None, t: Real, params: PyTree):
-    """q and v (None where it is not asked for), as elements see them. v may be any pytree of such shapes."""
+    """q and v (None if not needed) with prescribed values inserted, as elements see them. v may be any pytree of such
+    shapes."""
     if held is None or not held.moves:
         return q, v
     like = v if v is not None else velocity_like(q)
@@ -159,7 +161,7 @@ def velocity_like(q: PyTree) -> PyTree:
 
 
 class Known(NamedTuple):
-    """What is held, structured like v. here: which numbers; moves: which of them are told where to be; a: their
+    """The held coordinates, structured like v. here: which coordinates; moves: which of them are moved; a: their
     accelerations."""
 
     here: PyTree
@@ -168,7 +170,7 @@ class Known(NamedTuple):
 
 
 def accelerations(held: Held, v: PyTree, t: Real, params: PyTree) -> Known:
-    """What is held, at a time."""
+    """The held coordinates at a time."""
     known = moves = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), bool), v)
     a = jax.tree.map(jnp.zeros_like, v)
     for some in held.all():
@@ -187,7 +189,7 @@ def accelerations(held: Held, v: PyTree, t: Real, params: PyTree) -> Known:
 
 
 def staying(held: Held | None, v: PyTree) -> np.ndarray | None:
-    """(n,): which numbers stay where they start; None for none."""
+    """(n,): which coordinates are held at their start; None if none is."""
     still = None
     for some in () if held is None else held.all():
         if isinstance(some.how, Still):
@@ -200,7 +202,7 @@ def staying(held: Held | None, v: PyTree) -> np.ndarray | None:
 
 
 def _spread(which: PyTree, here: PyTree) -> PyTree:
-    """Booleans of the shapes of a node, from what was given: of a key, or of each number of it."""
+    """Booleans of the shapes of a node, from one for each key, or for each component of it."""
 
     def spread(flag: np.ndarray, x: np.ndarray) -> np.ndarray:
         try:
@@ -221,7 +223,7 @@ def _as_arrays(which: PyTree) -> PyTree:
 
 
 def checked(held: Any) -> Held | None:
-    """The `Held` of a dict, or an error."""
+    """The `Held` of a dict; raises an error for anything else."""
     if held is None or isinstance(held, Held):
         return held
     name = "System.from_elements"
@@ -264,7 +266,7 @@ class _Flags(dict):
 
 
 def require_held_start(caller: str, system: Any, q0: PyTree, v0: PyTree, t0: Real, params: PyTree):
-    """An error where a start that is known is not what is held."""
+    """Raises an error if a concrete start differs from what `held` prescribes."""
     if getattr(getattr(system, "force", None), "held", None) is None:
         return
     found = known_now(_known_start, system, q0, v0, t0, params)
@@ -280,14 +282,14 @@ def require_held_start(caller: str, system: Any, q0: PyTree, v0: PyTree, t0: Rea
             if np.max(apart) > agrees * max(1.0, np.max(np.abs(y))):
                 node = int(np.argmax(apart))
                 raise ValueError(
-                    f"{caller}: `{name}{jax.tree_util.keystr(path)}` of node {node} must be what `held` gives at the "
-                    f"start, {y[node]}; received {x[node]}."
+                    f"{caller}: `{name}{jax.tree_util.keystr(path)}` of node {node} must be what `held` prescribes at "
+                    f"the start, {y[node]}; received {x[node]}."
                 )
 
 
 @Programs
 def _known_start(system: Any, q0: PyTree, v0: PyTree, t0: Real, params: PyTree):
-    """q0 and v0 as they are told, and which numbers stay."""
+    """q0 and v0 with prescribed values inserted, and which coordinates are held."""
     held = system.force.held
     known = accelerations(held, v0, t0, params)
     return *at(held, q0, v0, t0, params), jax.tree.map(lambda here, moves: here & ~moves, known.here, known.moves)

@@ -1,4 +1,4 @@
-"""Initial values that satisfy the constraints, and the check that they do."""
+"""Initial values: their checks, and values that satisfy the constraints."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ class ConsistentInitial(NamedTuple):
         q, v, acceleration: pytrees like q0 and v0.
         multipliers: L, (m,).
         converged: whether a point with Phi(q) = 0 was found.
-        moved: how far q is from q0 in the coordinate that is farthest, in its unit, radians for rotations. Compare it
-            with how well q0 was meant: a start far away may be of another assembly than that which was thought of.
+        moved: the distance of q from q0 in the coordinate that moved farthest, in its unit, radians for rotations. If
+            it is larger than you expect, q may belong to another assembly of the mechanism.
     """
 
     q: PyTree
@@ -79,21 +79,22 @@ def consistent_initial(
     redundant: str | None = None,
     z0: PyTree = None,
 ) -> ConsistentInitial:
-    """The values nearest to q0 and v0 that satisfy the constraints, with the acceleration and multipliers there.
+    """The values nearest to q0 and v0 that satisfy the constraints, with their acceleration and multipliers.
 
         min |q - q0|_M with Phi(q, t0) = 0,     min |v - v0|_M with B v + Phi_t = 0,     |x|_M^2 = x^T M x
 
-    M at q0 for the first, at q for the second. Then M w = Q + B^T L with the second time derivative of Phi zero.
+    M is evaluated at q0 for the first problem, at q for the second. The acceleration solves M w = Q + B^T L with a
+    second time derivative of Phi that is zero.
 
     Args:
         system: a `System` with a constraint. q0, v0, params, t0: as in `simulate`.
         redundant: "least_squares" for constraints that may depend on each other, as in `hht`.
-        z0: internal states, where the system has some; they enter the forces, and stay as they are.
+        z0: internal states, if the system has any. They enter the forces and do not change.
 
-    q is found by steps that fall towards the constraints and towards q0, not by Newton's alone, which from afar ends
-    anywhere. Where the constraints bend on the way it is the nearest of up to 24 searches; nothing proves that there is
-    no nearer one. `moved` tells the distance.
-    Differentiable, forward and reverse. Under jit nothing raises, and `converged` tells.
+    The search for q takes steps that descend both towards the constraints and towards q0. Newton's method alone would
+    end at an arbitrary point when it starts far away. If the constraints are curved on the way, the result is the
+    nearest of up to 24 searches. A nearer point may exist; `moved` is the distance. Differentiable, forward and
+    reverse. Under jit nothing is raised: look at `converged`.
 
     Returns:
         A `ConsistentInitial`.
@@ -130,7 +131,7 @@ def consistent_initial(
 
 @partial(Programs, static_argnames="redundant")
 def _consistent_initial(system: System, q0: PyTree, v0: PyTree, params: PyTree, t0: Array, z0: PyTree, redundant):
-    """The result, B at q0 and which rows are clear, and max|Phi| at the end."""
+    """The result; B at q0 and which of its rows are independent; and max|Phi| at the end."""
     flat, q, v = flatten("consistent_initial", system, q0, v0, t0, params, z0)
     factorize = factorize_constrained(flat.size, redundant)
     t = jnp.asarray(t0).astype(q.dtype)
@@ -145,13 +146,13 @@ def _consistent_initial(system: System, q0: PyTree, v0: PyTree, params: PyTree, 
 
 
 def correction(system: FlatSystem, q: Array, t: Array, params: PyTree, rows: Array, factorize: Callable) -> Array:
-    """The x with B x = rows that is smallest in the norm of M."""
+    """The solution x of B x = rows with the smallest M-norm."""
     return saddle_point(system, q, t, params, factorize)(jnp.zeros(system.size, q.dtype), rows)[0]
 
 
 @Programs
 def examine(system: System, q0: PyTree, v0: PyTree, t0: Array, params: PyTree, z0: PyTree):
-    """M and B, Phi and dPhi/dt, the sizes of the coordinates and of their rates, and which rows of B are clear."""
+    """M and B, Phi and dPhi/dt, the sizes of coordinates and rates, and which rows of B are independent."""
     flat, q, v = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
     M, (B, clear) = flat.mass(q, t, params), gradient(flat, q, t, params)
@@ -161,8 +162,9 @@ def examine(system: System, q0: PyTree, v0: PyTree, t0: Array, params: PyTree, z
 
 
 def distances(examined: tuple, redundant):
-    """For Phi and dPhi/dt: what they violate, and how far q0 and v0 are from values that do not, in the coordinate that
-    is farthest, in that which is farthest beside its own size, and in each; by NumPy, which has nothing to compile."""
+    """For Phi and for dPhi/dt: the violation, and the distance of q0 or v0 from consistent values, as the largest over
+    coordinates, the largest relative to the coordinate's size, and for each coordinate. By NumPy, which compiles
+    nothing."""
     M, B, both, sizes, _ = jax.tree.map(np.asarray, examined)
     n, end = M.shape[-1], M.shape[-1] + B.shape[-2]
     A = np.zeros((*M.shape[:-2], end, end), M.dtype)
@@ -175,7 +177,8 @@ def distances(examined: tuple, redundant):
 
 @np.errstate(all="ignore")
 def _solved(A: np.ndarray, b: np.ndarray, n: int, redundant) -> np.ndarray:
-    """z with A z = b, smallest where constraints may be redundant; NaN where there is none. A batch goes first."""
+    """The solution z of A z = b, the smallest one if constraints may be redundant; NaN if there is none. Batch axes
+    come first."""
     try:
         if redundant is None:
             return np.linalg.solve(A, b[..., None])[..., 0]
@@ -204,9 +207,10 @@ def require_consistent(
     z0: PyTree = None,
     checked: tuple = CHECKED,
 ):
-    """An error if q0 or v0 is farther than rounding from the constraints, or these from independence; tracers pass.
+    """Raises an error if q0 or v0 violates the constraints by more than rounding, or if these are dependent; tracers
+    pass.
 
-    checked: what the caller names q0, and v0 if it is to be looked at, and what they violate.
+    checked: the names of the caller's arguments for q0, and for v0 if it is to be checked, and what they violate.
     """
     if redundant is None and isinstance(getattr(system, "force", None), ElementForce):
         return require_consistent_elements(caller, (system, q0, v0, t0, params, z0), checked, CONSISTENT)
@@ -230,8 +234,8 @@ def require_consistent(
 
 
 def _is_far(B, away, start):
-    """Whether a displacement of this size, or one in a unit of time, turns a constraint's gradient by more than SMALL:
-    the size of a mechanism is in nothing but that. Asked of what is more than rounding."""
+    """Whether a displacement of this size, or one per unit of time, turns the gradient of a constraint by more than
+    SMALL. Only this shows the size of a mechanism. Called for displacements above rounding."""
     found = known_now(_turns, *start)
     assert found is not None  # as what was examined
     turns, d = found
@@ -240,7 +244,8 @@ def _is_far(B, away, start):
 
 @Programs
 def _turns(system, q0: PyTree, v0: PyTree, t0, params: PyTree, z0: PyTree):
-    """By how much a displacement of size 1 turns the gradient of each constraint, in the norm of diag(M), and that."""
+    """By how much a displacement of size 1 turns the gradient of each constraint, in the norm of diag(M), and that
+    norm."""
     flat, q, _ = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
     d = diagonal(flat.mass(q, t, params))
@@ -310,12 +315,13 @@ def initial_values(caller: str, system, q0: PyTree, v0: PyTree, z0: PyTree = Non
 
 
 def _as_state(x: Real, dtype: np.dtype) -> Array:
-    """An array of JAX of this dtype; one that is such already as it is, because asking takes JAX 7 us."""
+    """An array of JAX with this dtype. An array that already has it is returned as it is, since a conversion takes JAX
+    7 us."""
     return x if isinstance(x, jax.Array) and x.dtype == dtype and not x.weak_type else jnp.asarray(x, dtype)
 
 
 def _the_one(caller: str, dtypes, q0: PyTree, v0: PyTree, z0: PyTree) -> np.dtype:
-    """The dtype that all share, or an error."""
+    """The dtype that all of them share; raises an error if they differ."""
     if len(dtypes) > 1:
         names = "`q0` and `v0`" if z0 is None else "`q0`, `v0` and `z0`"
         received = " and ".join(describe(x) for x in (q0, v0, z0) if x is not None)
@@ -324,7 +330,7 @@ def _the_one(caller: str, dtypes, q0: PyTree, v0: PyTree, z0: PyTree) -> np.dtyp
 
 
 def _require_internal(caller: str, system: LinearSystem | System, z0: PyTree):
-    """An error for a z0 that is missing, or that the system has no use for."""
+    """Raises an error for a z0 that is missing, or given to a system without internal states."""
     if system.internal is None:
         if z0 is not None:
             raise ValueError(f"{caller}: leave `z0` out: the system has no internal states; received {z0!r}.")
@@ -335,7 +341,7 @@ def _require_internal(caller: str, system: LinearSystem | System, z0: PyTree):
 
 
 def _require_finite(caller: str, name: str, path: tuple, leaf: Real) -> np.dtype:
-    """The dtype of a leaf, or an error for what is no array of finite numbers of single or double precision."""
+    """The dtype of a leaf; raises an error unless it holds finite numbers of single or double precision."""
     is_float = is_array(leaf) and leaf.dtype in SINGLE_OR_DOUBLE
     if is_float and (not is_concrete(leaf) or np.isfinite(np.asarray(leaf)).all()):
         return leaf.dtype
@@ -351,7 +357,7 @@ def _require_finite(caller: str, name: str, path: tuple, leaf: Real) -> np.dtype
 
 
 def _require_rotations(where: str, R):
-    """An error for matrices that are not orthogonal, or are reflections; tracers pass."""
+    """Raises an error for matrices that are not orthogonal, or are reflections; tracers pass."""
     if not is_concrete(R):
         return
     R = np.asarray(R)
@@ -389,8 +395,8 @@ def _rows(system: System, q0: PyTree, v0: PyTree, t0: Array, params: PyTree, z0:
 def with_known_rows(
     caller: str, system, q0: PyTree, v0: PyTree, t0: Real, params: PyTree, z0: PyTree = None
 ) -> LinearSystem | System:
-    """The system, marked where directions of friction depend on each other, or on constraints; an error for what are
-    none. Of tracers nothing is known."""
+    """The system, marked if directions of friction depend on each other or on constraints. Raises an error for
+    directions that are zero or not finite. Nothing is known of tracers."""
     rows = known_now(_rows, system, q0, v0, t0, params, z0)
     if rows is None:
         return system
@@ -411,7 +417,7 @@ def with_known_rows(
 
 
 def _depend(B: np.ndarray, H: np.ndarray) -> bool:
-    """Whether a row of H depends on those before it, or on the rows of B."""
+    """Whether a row of H depends on the rows before it, or on the rows of B."""
     basis = np.zeros((0, H.shape[1]))
     if B.size:
         _, sizes, basis = np.linalg.svd(B, full_matrices=False)
@@ -454,7 +460,7 @@ BENT = 0.1  # of Phi(q0), what either end's slope may miss of it where the first
 
 
 class Problem(NamedTuple):
-    """What the search knows of its guess."""
+    """The values at the initial guess that the search uses."""
 
     conditions: Any  # z -> (M x - B^T mu, Phi)
     constraint: Any  # x -> Phi
@@ -469,9 +475,9 @@ class Problem(NamedTuple):
 
 
 def nearest_position(system: FlatSystem, q0: PyTree, t: Array, params: PyTree, factorize: Callable):
-    """q on Phi = 0, its displacement x from q0 smallest in the norm of M(q0); x, and whether the search converged.
+    """q on Phi = 0 whose displacement x from q0 has the smallest norm of M(q0); x, and whether the search converged.
 
-    Derivatives are those of the conditions for a minimum.
+    Derivatives follow from the conditions for a minimum.
     """
     n, eps = system.size, float(jnp.finfo(q0.dtype).eps)
 
@@ -493,7 +499,7 @@ def nearest_position(system: FlatSystem, q0: PyTree, t: Array, params: PyTree, f
 
 
 def _problem(system: FlatSystem, q0: PyTree, t: Array, params: PyTree) -> Problem:
-    """Sizes and slopes at the guess."""
+    """Sizes and derivatives at the guess."""
     M, B = system.full_mass(q0, t, params), jacobian(system, q0, t, params)
     d = diagonal(M)
     d = jnp.where(d == 0, 1, d)
@@ -507,7 +513,7 @@ def _problem(system: FlatSystem, q0: PyTree, t: Array, params: PyTree) -> Proble
 
 
 def _search(p: Problem, z0: PyTree):
-    """The nearest of the points that were found, and 1 if there is one, else 0, as a float, for autodiff."""
+    """The nearest of the points that were found, and 1 if one was found, else 0, as a float for autodiff."""
     n, eps = len(p.d), float(jnp.finfo(z0.dtype).eps)
     ways = np.random.default_rng(0).standard_normal((STARTS, n))
     ways *= np.resize(PARTS, (STARTS, 1)) / np.linalg.norm(ways, axis=1, keepdims=True)
@@ -538,7 +544,7 @@ def _search(p: Problem, z0: PyTree):
 
 
 def _descend(p: Problem, z0: PyTree):
-    """Where steps from z0 end, and whether that is a point on the constraints."""
+    """The point where the steps from z0 end, and whether it lies on the constraints."""
     n, eps = len(p.d), float(jnp.finfo(z0.dtype).eps)
 
     def largest(z: Array) -> Array:

@@ -1,7 +1,7 @@
-"""Positions that hold rotations: how a displacement moves them, and what becomes of its rates.
+"""Positions with rotations: how a displacement changes them, and how its rates are related to velocities.
 
-A leaf R (..., 3, 3) of q whose leaf of v is Om (..., 3) is a rotation, Rdot = R hat(Om); of all other leaves, qdot = v.
-A displacement x (n,) is like v: on a rotation it is the rotation vector of the increment.
+A leaf R (..., 3, 3) of q whose leaf of v is Om (..., 3) is a rotation, Rdot = R hat(Om). For all other leaves qdot = v.
+A displacement x (n,) is structured like v; for a rotation it is the rotation vector of the increment.
 
     q (+) x = q + x,  or  R exp(x)
 
@@ -9,8 +9,8 @@ In chart form the recursion of a step runs on the rotation vector psi from R_n, 
 
     Om = T(psi) psidot,    A = T(psi) psiddot + Tdot psidot
 
-give the angular velocity and acceleration at its end (Cardona, Geradin 1989, Eq. 69-71). In Lie form they take the
-place of psidot and psiddot.
+give the angular velocity and acceleration at its end (Cardona, Geradin 1989, Eq. 69-71). In Lie form, Om and A are used
+directly instead of psidot and psiddot.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from hhtjax.numerics.dense_lu import matvec
 
 
 class Block(NamedTuple):
-    """Neighbouring coordinates: plain ones, or rotations, with 9 numbers in q and 3 in v for each."""
+    """A block of adjacent coordinates: plain ones, or rotations, each with 9 numbers in q and 3 in v."""
 
     is_rotation: bool
     q: slice
@@ -35,7 +35,7 @@ class Block(NamedTuple):
 
 
 def layout(q0: PyTree, v0: PyTree):
-    """The blocks of the flat vectors of q0 and v0; empty where there is no rotation."""
+    """The blocks of the flat vectors of q0 and v0; empty if there are no rotations."""
     blocks, nq, nv = [], 0, 0
     for R, Om in zip(jax.tree.leaves(q0), jax.tree.leaves(v0), strict=True):
         q, v = slice(nq, nq + R.size), slice(nv, nv + Om.size)
@@ -60,27 +60,28 @@ def rate(blocks: tuple, q: Array, v: Array) -> Array:
 
 
 def terms(blocks: tuple, q0: PyTree, q1: Array, x: Array) -> Array:
-    """Sizes of what q1 is the sum of, q0 and a displacement up to x: (n,) of positions, 1 for those of rotations."""
+    """The sizes of the terms of q1, which is the sum of q0 and a displacement of at most x: (n,) for positions, 1 for
+    rotations."""
     return _each(blocks, lambda q0, q1, x: jnp.abs(q0) + jnp.abs(q1) + x, lambda R, *_: jnp.ones_like(R), q0, q1, x)
 
 
 def sizes(blocks: tuple, q: Array) -> Array:
-    """Of displacements, (n,): |q| of positions, and one radian for rotations."""
+    """The sizes of displacements, (n,): |q| for positions, and one radian for rotations."""
     return _each(blocks, jnp.abs, lambda R: jnp.ones(3, R.dtype), q)
 
 
 def orthonormalize(blocks: tuple, q: Array) -> Array:
-    """q with the rounding errors of its rotations squared."""
+    """q with the rounding errors of its rotations squared, that is, practically removed."""
     return _each(blocks, lambda q: q, rotation.orthonormalize, q)
 
 
 def pull_back(blocks: tuple, x: Array, Q: Array) -> Array:
-    """The force that works on the rate of the displacement x: Q, and T(x)^T Q for rotations."""
+    """The force conjugate to the rate of the displacement x: Q, and T(x)^T Q for rotations."""
     return _each(blocks, lambda Q, x: Q, lambda Q, psi: matvec(rotation.tangent(psi).T, Q), Q, x)
 
 
 def chart_jerk(blocks, v, w, wdot) -> Array:
-    """Third rate of the displacement at x = 0: that of v, and for rotations wdot + Om x w/2."""
+    """The third rate of the displacement at x = 0: the second rate of v, and wdot + Om x w/2 for rotations."""
     return _each(blocks, lambda wdot, v, w: wdot, lambda wdot, Om, w: wdot + rotation.cross(Om, w) / 2, wdot, v, w)
 
 
@@ -101,7 +102,8 @@ def end_of_chart(blocks: tuple, x: Array, v: Array, w: Array, a: Array):
 
 
 def in_chart(blocks: tuple, x: Array, v: Array, w: Array) -> Array:
-    """The second rate of the displacement x, whose first is v, of an acceleration w: `end_of_chart`, backwards."""
+    """The second rate of the displacement x, given its first rate v and the acceleration w; the inverse of
+    `end_of_chart`."""
 
     def turn(w: Array, psi: Array, psidot: Array) -> Array:
         return matvec(rotation.inverse_tangent(psi), w - rotation.tangent_rate(psi, psidot))
@@ -110,12 +112,12 @@ def in_chart(blocks: tuple, x: Array, v: Array, w: Array) -> Array:
 
 
 def hermite(rise: Array, d0: Array, d1: Array, s: Array) -> Array:
-    """The cubic in s from 0 at 0 to `rise` at 1, with slopes d0 and d1 there."""
+    """The cubic in s from 0 at 0 to `rise` at 1, with the slopes d0 and d1 there."""
     return s * (d0 + s * (3 * rise - 2 * d0 - d1 + s * (d0 + d1 - 2 * rise)))
 
 
 def hermite_rate(rise: Array, d0: Array, d1: Array, s: Array) -> Array:
-    """Its slope."""
+    """The slope of the cubic."""
     return d0 + s * (2 * (3 * rise - 2 * d0 - d1) + s * (3 * (d0 + d1 - 2 * rise)))
 
 
@@ -150,5 +152,5 @@ def _each(blocks: tuple, plain: Callable, turn: Callable, *vectors):
 
 
 def _turned(turn: Callable, *arrays: Real) -> PyTree:
-    """`turn` on each of several rotations; on a single one without vmap, which leaves less to compile."""
+    """`turn` on each of several rotations; a single one is done without vmap, which compiles less."""
     return turn(*(y[0] for y in arrays)) if len(arrays[0]) == 1 else jax.vmap(turn)(*arrays)

@@ -1,4 +1,4 @@
-"""Linear systems, and such with a nonlinear force beside: M w + C v + K q = f(t) + g(q, v, t)."""
+"""Linear systems, optionally with an additional nonlinear force: M w + C v + K q = f(t) + g(q, v, t)."""
 
 from __future__ import annotations
 
@@ -26,32 +26,33 @@ if TYPE_CHECKING:
 class LinearSystem(Description):
     """The linear system  M w + C v + K q = f(t), whose step matrix is factorised once for a whole run.
 
-    With a nonlinear force g(q, v, t) beside it,  M w + C v + K q = f(t) + g.  The `hht` family then evaluates the
-    Jacobian of g alone. Where g acts between a few coordinates, which are named by `at`, it updates the inverse of the
-    constant matrix (Woodbury), and still factorises once; else it factorises once in a step.
+    With an additional nonlinear force g(q, v, t),  M w + C v + K q = f(t) + g.  The `hht` family then evaluates only
+    the Jacobian of g. If g acts on a few coordinates, named by `at`, it updates the inverse of the constant matrix
+    (Woodbury), and still factorises once per run. Otherwise it factorises once per step.
 
     Args:
-        M, C, K: mass, damping and stiffness: arrays (n, n), or (n,) for a diagonal, or matrices of scipy.sparse, such
-            as `scipy.io.mmread` gives, or functions of params that return arrays, or what `hhtjax.sparse` makes. C and
-            K may be None. Rows follow `jax.flatten_util.ravel_pytree(v)`. Sparse matrices of more than 300 rows stay
-            sparse, are factorised by SciPy's SuperLU, and solved with in each step by the `hht` family and
-            Rosenbrock methods, with the same derivatives; smaller ones become dense, or diagonals.
-            M may be singular where M and C are arrays, and C damps all coordinates without mass, such as the node
-            between a spring and a damper: with the `hht` family, whose smooth start never divides by M, and fixed
-            steps, without events, held inputs and friction. q is of order 2, v as well but for alpha = 0, where that
-            of a weak damper swings. Accelerations of such coordinates are 0 at the start, and tend to the right ones
-            as the spectral radius at infinity decays. A coordinate without mass on springs alone follows the others,
-            K22 q2 = f2 - K21 q1: eliminate it, or give it a damper, as of 1e-6 h K22.
+        M, C, K: mass, damping and stiffness: arrays (n, n), or (n,) for a diagonal; or matrices of scipy.sparse, such
+            as from `scipy.io.mmread`; or functions of params that return arrays or results of `hhtjax.sparse`. C and K
+            may be None. Rows follow `jax.flatten_util.ravel_pytree(v)`. Sparse matrices with more than 300 rows stay
+            sparse: SciPy's SuperLU factorises them, and the `hht` family and Rosenbrock methods solve with the factors
+            in each step, with the same derivatives. Smaller ones become dense, or diagonals.
+
+            M may be singular if M and C are arrays, and C damps all coordinates without mass, such as the node between
+            a spring and a damper. This needs the `hht` family, whose smooth start never divides by M, and fixed steps,
+            without events, held inputs and friction. q then has order 2, and so has v except for alpha = 0, where v of
+            a weakly damped coordinate oscillates. Accelerations of such coordinates are 0 at the start, and tend to the
+            correct ones like powers of the spectral radius at infinity. A coordinate without mass that only has springs
+            follows the others, K22 q2 = f2 - K21 q1: eliminate it, or give it a damper, such as 1e-6 h K22.
         force: f, `force(t, params)`, a pytree structured like v; None for free vibration.
-        nonlinear: g, `nonlinear(q, v, t, params)`, a pytree structured like v. With `at`: of the coordinates q[at] and
-            v[at], (k,) each, the forces (k,) on these.
-        at: k different numbers of coordinates, in the order of `ravel_pytree(v)`.
+        nonlinear: g, `nonlinear(q, v, t, params)`, a pytree structured like v. With `at` it takes the coordinates q[at]
+            and v[at], (k,) each, and returns the forces (k,) on these.
+        at: k different indices of coordinates, in the order of `ravel_pytree(v)`.
         friction, sliding: dry friction, as for `System`: `friction(q, v, t, params)`, `sliding(q, v, t, params)`. The
-            derivative of `sliding` in v is to be the same for all q; slopes of limits update the inverse, too.
+            derivative of `sliding` in v must be the same for all q. Derivatives of the limits update the inverse, too.
 
     Raises:
-        TypeError, ValueError: an argument that is neither, or an array of a wrong shape or not finite; numbers `at`
-            that are none of coordinates, or without a force; `sliding` without `friction`.
+        TypeError, ValueError: a matrix that is neither an array nor a function, or of a wrong shape, or not finite;
+            `at` with indices that do not exist, or without `nonlinear`; `sliding` without `friction`.
 
     Example: a mass of 2 kg on a spring of 200 N/m, started from 0.1 m. One period is 0.628 s.
 
@@ -63,7 +64,7 @@ class LinearSystem(Description):
     >>> round(float(solution.q[-1, 0]), 6)
     0.1
 
-    A chain of 40 masses whose last one meets a stop:
+    A chain of 40 masses whose last mass hits a stop:
 
     >>> K = 2 * jnp.eye(40) - jnp.eye(40, k=1) - jnp.eye(40, k=-1)
     >>> def stop(q, v, t, params):
@@ -139,7 +140,7 @@ class LinearSystem(Description):
     depending = False  # whether rows of `sliding` are known to depend on each other, or on constraints
 
     def mass(self, q: Array, params: PyTree):
-        """M, whatever q."""
+        """M, for any q."""
         return self.M(params) if callable(self.M) else self.M
 
     def force(self, q: Array, v: Array, t: Array, params: PyTree) -> Array:
@@ -151,7 +152,7 @@ class LinearSystem(Description):
         return unravel(Q + self.spread(self.local_force(q, v, t, params), Q.size))
 
     def with_matrices(self, M, C, K) -> LinearSystem:
-        """The same with these in the place of functions."""
+        """The system with these matrices instead of functions."""
         new = object.__new__(LinearSystem)
         for name, value in {**vars(self), "M": M, "C": C, "K": K}.items():
             object.__setattr__(new, name, value)
@@ -182,7 +183,7 @@ class LinearSystem(Description):
         return ravel_pytree(self.nonlinear(q, v, t, params))[0]
 
     def spread(self, x: Array, n: int) -> Array:
-        """Numbers (k,) of the coordinates `at` as a vector (n,)."""
+        """Values (k,) at the coordinates `at`, as a vector (n,)."""
         if self.at is None:
             return x
         place = np.full(n, len(self.at))
@@ -191,7 +192,7 @@ class LinearSystem(Description):
 
 
 def _numbers_of_coordinates(at: list, nonlinear, size: int | None):
-    """`at` as a tuple of integers, or an error."""
+    """`at` as a tuple of integers; raises an error for anything else."""
     if nonlinear is None:
         raise ValueError(f"LinearSystem: `at` must go with a `nonlinear` force; received {at!r} alone.")
     try:
@@ -211,19 +212,19 @@ def _numbers_of_coordinates(at: list, nonlinear, size: int | None):
 
 
 def shapes_of_matrices(caller: str, system: LinearSystem, params: PyTree):
-    """Of the matrices that a linear system has, by name: what they are, or what their functions return."""
+    """The matrices that a linear system has, by name: their values, or the results of their functions."""
     given = {name: A for name in "MCK" if (A := getattr(system, name)) is not None}
     return {name: evaluate(caller, name, A, params) if callable(A) else A for name, A in given.items()}
 
 
 def sparse_matrices(caller: str, system: LinearSystem | System | FirstOrderSystem, params: PyTree) -> dict:
-    """Of a linear system those matrices that are sparse, by name; none of another."""
+    """The sparse matrices of a linear system, by name; empty for other systems."""
     found = shapes_of_matrices(caller, system, params) if isinstance(system, LinearSystem) else {}
     return {name: A for name, A in found.items() if isinstance(A, Sparse)}
 
 
 def require_dense(caller: str, system: LinearSystem | System | FirstOrderSystem, params: PyTree):
-    """An error for a linear system with sparse matrices."""
+    """Raises an error for a linear system with sparse matrices."""
     for name, A in sparse_matrices(caller, system, params).items():
         raise NotImplementedError(
             f"{caller}: `{name}` must be an array; received a sparse matrix of {len(A)} rows: "
@@ -234,7 +235,7 @@ def require_dense(caller: str, system: LinearSystem | System | FirstOrderSystem,
 def with_known_matrices(
     caller: str, system: LinearSystem, flat: FlatSystem, on_vectors: Callable, dtype: np.dtype, params: PyTree
 ) -> FlatSystem:
-    """The flat system as one that keeps its matrices sparse, or diagonal, where they are.
+    """The flat system with its matrices kept sparse or diagonal, if they are.
 
     on_vectors: makes the flat system of a `LinearSystem`.
     """
@@ -258,7 +259,7 @@ def with_known_matrices(
 
 
 def _require_sparse(caller: str, system: LinearSystem, shapes: dict):
-    """An error for what does not go with sparse matrices."""
+    """Raises an error for what is not supported with sparse matrices."""
     for name, A in shapes.items():
         if not isinstance(A, Sparse) and len(A.shape) > 1:
             raise ValueError(
@@ -272,6 +273,6 @@ def _require_sparse(caller: str, system: LinearSystem, shapes: dict):
 
 
 def _knowing(flat: FlatSystem, **matrices: Callable) -> FlatSystem:
-    """The system, and its linear part, with this function for its matrices."""
+    """The system, and its linear part, with this function applied to its matrices."""
     local = None if flat.local is None else flat.local._replace(linear=flat.local.linear._replace(**matrices))
     return flat._replace(**matrices, local=local)

@@ -1,4 +1,4 @@
-"""Constant matrices of a system, as arrays (n, n) or diagonals (n,): from arrays, lists and scipy.sparse, checked."""
+"""Checks of constant matrices: arrays, lists and scipy.sparse become arrays (n, n) or diagonals (n,)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ LARGEST_DENSE = 5000  # rows of a sparse matrix that is made dense: 200 MB
 SMALL = 300  # rows of a sparse matrix up to which a dense one is solved as quickly
 SYMMETRIC = 1e-6  # relative size of M - M^T that passes
 MASSLESS = (
-    "A coordinate without mass has no acceleration of its own: say its equilibrium as a `constraint`, or, if it is "
-    "damped, make it an internal state whose rate the balance of its forces gives"
+    "A coordinate without mass has no acceleration of its own: write its equilibrium as a `constraint`; or, if it is "
+    "damped, make it an internal state, whose rate follows from the balance of its forces"
 )
 
 
@@ -30,19 +30,19 @@ def as_matrix(value, dtype: np.dtype):
 
 
 def sparse(matrix: Any) -> Sparse:
-    """A sparse matrix whose numbers are data, for functions of params in a `LinearSystem`.
+    """A sparse matrix whose values are data, for functions of params in a `LinearSystem`.
 
-    Its multiples, sums and differences are sparse, too: `lambda params: params["k"] * K + params["shift"] * M`. What is
-    constant in a `LinearSystem` needs no such thing.
+    Its multiples, sums and differences are sparse, too: `lambda params: params["k"] * K + params["shift"] * M`.
+    Constant matrices of a `LinearSystem` do not need it.
 
     Args:
         matrix: of scipy.sparse, (n, n).
 
     Returns:
-        A `Sparse`: data for jit, vmap and derivatives are its `values`; where they are belongs to the program.
+        A `Sparse`. Its `values` are data for jit, vmap and derivatives; its pattern is part of the program.
 
     Raises:
-        TypeError, ValueError: what is no such matrix, is not square, or not finite.
+        TypeError, ValueError: not a matrix of scipy.sparse, not square, or not finite.
 
     >>> import jax.numpy as jnp, numpy as np, hhtjax, scipy.sparse
     >>> n = 20_000
@@ -63,7 +63,7 @@ def sparse(matrix: Any) -> Sparse:
 
 
 def _sparse(caller: str, name: str, matrix) -> Sparse:
-    """The `Sparse` of a matrix of scipy.sparse, or an error."""
+    """The `Sparse` of a matrix of scipy.sparse; raises an error for others."""
     if len(matrix.shape) != 2 or matrix.shape[0] != matrix.shape[1]:
         raise ValueError(
             f"{caller}: `{name}` must have shape (n, n), or (n,) for a diagonal; received shape {matrix.shape}."
@@ -77,9 +77,10 @@ def _sparse(caller: str, name: str, matrix) -> Sparse:
 
 
 def constant_matrix(caller: str, name: str, received: PyTree, keep: bool = False) -> Real:
-    """The array (n, n) or (n,), or an error; of a matrix of scipy.sparse, the diagonal that it is, or a dense one.
+    """The array (n, n) or (n,); raises an error for anything else. A matrix of scipy.sparse becomes a diagonal if it is
+    one, else dense.
 
-    keep: more than SMALL rows stay sparse, as does a `Sparse`.
+    keep: matrices with more than SMALL rows stay sparse, and so does a `Sparse`.
     """
     if is_sparse(received):
         if keep and (isinstance(received, Sparse) or _stays_sparse(received)):
@@ -107,7 +108,7 @@ def constant_matrix(caller: str, name: str, received: PyTree, keep: bool = False
 
 
 def is_sparse(x: PyTree) -> bool:
-    """A matrix, or array, of scipy.sparse, which is not imported for it."""
+    """Whether it is a matrix or array of scipy.sparse; does not import scipy."""
     return hasattr(x, "tocoo") and hasattr(x, "nnz")
 
 
@@ -116,7 +117,7 @@ def _stays_sparse(matrix):
 
 
 def half_bandwidth(entries):
-    """p with A[i, j] = 0 for |i - j| > p, of a matrix in scipy.sparse's format of coordinates."""
+    """The half bandwidth p, with A[i, j] = 0 for |i - j| > p, of a matrix in scipy.sparse's COO format."""
     return int(np.max(np.abs(entries.row.astype(int) - entries.col), initial=0))
 
 
@@ -136,13 +137,13 @@ def _dense(caller: str, name, matrix):
 
 
 UNDAMPED = (
-    "In a LinearSystem a coordinate without mass has to be damped, however weakly, by a constant array `C`. One with "
-    "springs alone follows the others, K22 q2 = f2 - K21 q1: eliminate it, or give it a damper, as of 1e-6 h K22"
+    "In a LinearSystem a coordinate without mass must be damped, however weakly, by a constant array `C`. One that "
+    "only has springs follows the others, K22 q2 = f2 - K21 q1: eliminate it, or give it a damper, such as 1e-6 h K22"
 )
 
 
 def massless_inverse(M, C):
-    """G with M G M = M, of a singular M where C damps all coordinates without mass; None of others, and of tracers."""
+    """G with M G M = M, for a singular M if C damps all coordinates without mass; None for others, and for tracers."""
     if isinstance(M, Sparse) or not is_array(C) or not (is_concrete(M) and is_concrete(C)) or len(M) > LARGEST_CHECKED:
         return None
     M, C = (np.diag(x) if x.ndim == 1 else np.asarray(x) for x in (M, C))
@@ -165,10 +166,11 @@ def massless_inverse(M, C):
 
 
 def require_mass(caller: str, name: str, M, massless: bool = False, way: str = MASSLESS):
-    """An error for a constant M that is not symmetric, or not positive definite; with constraints it may be singular.
+    """Raises an error for a constant M that is not symmetric, or not positive definite; with constraints it may be
+    singular.
 
-    In units in which its diagonal is 1. Tracers pass, and what is too large for a look at each run. way: what to do
-    where it is singular.
+    The check uses units in which the diagonal of M is 1. Tracers pass, and so do matrices too large to be checked in
+    each run. way: what to do about a singular M.
     """
     if isinstance(M, Sparse):
         return _require_sparse_mass(caller, name, M)
@@ -190,7 +192,7 @@ def require_mass(caller: str, name: str, M, massless: bool = False, way: str = M
 
 
 def _require_sparse_mass(caller: str, name: str, M: Sparse):
-    """What of it can be seen without a factorisation."""
+    """Checks that need no factorisation."""
     if not is_concrete(M.values):
         return
     A = M.tocoo()
@@ -204,9 +206,9 @@ UNSYMMETRIC, INDEFINITE, OF_VELOCITY = 1, 2, 3  # what may be wrong with a mass
 
 
 def mass_flaw(M: Array | Sparse, massless: bool) -> Array:
-    """What `require_mass` would find wrong with a mass that is known when it runs, as a number; 0: nothing.
+    """A number for what `require_mass` would report, for a mass that is known only at run time; 0: nothing.
 
-    NaN passes: the acceleration tells of it.
+    NaN passes, because the acceleration shows it.
     """
     if len(M) > LARGEST_CHECKED or isinstance(M, Sparse):
         return jnp.zeros((), jnp.int32)

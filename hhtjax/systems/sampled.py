@@ -1,4 +1,4 @@
-"""A sampled input as a function of time, and as data: samples at equal distances, or at any increasing times."""
+"""`sampled`: an input given by samples, at equal distances or at any increasing times, as a function of time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Sampled:
     times: Any = None  # of the samples, where they are not uniform
 
     def __call__(self, t: Real) -> Array:
-        """Value at time t, a scalar or an array; outside the samples, the nearest end value."""
+        """The value at time t, a scalar or an array. Outside the samples it is the nearest end value."""
         intervals, terms = self.polynomials.shape[:2]
         i, x = self._uniform(t, intervals, terms) if self.times is None else self._find(t, intervals, terms)
         x = x.reshape(x.shape + (1,) * (self.polynomials.ndim - 2))
@@ -39,7 +39,7 @@ class Sampled:
         return value
 
     def _uniform(self, t: Real, intervals: int, terms: int):
-        """Number of the interval of t, and the place in it, from 0 to 1."""
+        """The number of the interval that contains t, and the position in it, from 0 to 1."""
         # a division: in some copies XLA makes it a product, and one number rounds to two on both sides of a sample
         x = (jnp.asarray(t).astype(self.dt.dtype) - self.t0) * (1 / self.dt)
         if terms == 1:  # a jump: at a sample, up to rounding, the new value
@@ -49,7 +49,7 @@ class Sampled:
         return i.astype(jnp.int32), x
 
     def _find(self, t: Real, intervals: int, terms: int):
-        """The same by bisection, as many halvings as the number of samples asks for, whatever t."""
+        """As `_uniform`, by bisection. The number of halvings depends on the number of samples, not on t."""
         t = jnp.asarray(t).astype(self.times.dtype)
         if terms == 1:
             i = self._last_before(t + self._rounding(t), intervals)
@@ -58,7 +58,7 @@ class Sampled:
         return i, _inside((t - self.times[i]) / (self.times[i + 1] - self.times[i]))
 
     def _last_before(self, t: Array, intervals: int) -> Array:
-        """Number of the last of the first `intervals` samples that is not after t; 0 where all are."""
+        """The number of the last of the first `intervals` samples that is not after t; 0 if all are after t."""
         i = jnp.zeros(t.shape, jnp.int32)
         for half in reversed(range((intervals - 1).bit_length())):
             further = i + (1 << half)
@@ -70,15 +70,15 @@ class Sampled:
         return SLOP * float(jnp.finfo(self.times.dtype).eps) * (jnp.abs(t) + jnp.abs(self.times[0]))
 
     def held_before(self, t: Array, dt: Array) -> Array:
-        """Of a held input the value that a step dt, or shorter, had which ended at t."""
+        """For a held input, the value during a step of at most dt that ended at t."""
         return self.polynomials[self.place_before(t, dt), 0]
 
     def place(self, t: Array) -> Array:
-        """Of a held input which of its values is that at t."""
+        """For a held input, the index of its value at t."""
         return (self._uniform if self.times is None else self._find)(t, len(self.polynomials), 1)[0]
 
     def place_before(self, t: Array, dt: Array) -> Array:
-        """Of a held input which of its values a step dt, or shorter, had that ended at t."""
+        """For a held input, the index of its value during a step of at most dt that ended at t."""
         if self.times is None:
             return self.place(t - dt / 2)
         t = jnp.asarray(t).astype(self.times.dtype)
@@ -86,7 +86,7 @@ class Sampled:
         return jnp.where(now > before, before, self.place(t - dt / 2))  # steps may differ at a sample
 
     def jump_after(self, t: Array) -> Array:
-        """Of a held input the time of its first jump after t; inf where there is none."""
+        """For a held input, the time of its first jump after t; inf if there is none."""
         intervals = len(self.polynomials)
         if self.times is None:
             i = 1 + self._uniform(t, intervals, 1)[0]
@@ -95,13 +95,13 @@ class Sampled:
         return jnp.where(i < intervals, self.times[jnp.minimum(i, intervals - 1)], jnp.inf)
 
     def jumps(self) -> np.ndarray:
-        """Of a held input the times at which it may jump, in NumPy: not for tracers."""
+        """For a held input, the times at which it may jump, as a NumPy array; not for tracers."""
         if self.times is not None:
             return np.asarray(self.times)[1:]
         return np.asarray(self.t0) + np.asarray(self.dt) * np.arange(1, len(self.polynomials))
 
     def constant(self, value: Array) -> Sampled:
-        """The held input that always has this value."""
+        """A held input that has this value at all times."""
         one = jnp.ones((), self.polynomials.dtype)
         scale = {"dt": one, "t0": one - 1, "times": None} if self.times is not None else {}
         return replace(self, polynomials=value[None, None], **scale)
@@ -115,28 +115,28 @@ def sampled(values: Real, dt: Real = None, t0: Real = 0.0, order: int = 3, *, ti
     """The function of time through `values[k]` at t0 + k dt, or at times[k]: a pytree for params, called with t.
 
     Args:
-        values: (samples,) or (samples, channels...), real; order + 1 samples at least.
+        values: (samples,) or (samples, channels...), real; at least order + 1 samples.
         dt: sampling period, positive; t0: time of the first sample.
-        times: (samples,), in the place of dt and t0: strictly increasing, at any distances. A call then costs a
-            bisection besides, some nanoseconds in a compiled run.
-        order: 0, each value held until the next, as a D/A converter does; 1, linear; 3, cubic spline, twice
+        times: (samples,), instead of dt and t0: strictly increasing, at any distances. A call then needs a
+            bisection too, some nanoseconds in a compiled run.
+        order: 0: each value is held until the next, as by a D/A converter; 1: linear; 3: cubic spline, twice
             continuously differentiable ("not-a-knot" ends, as in SciPy's CubicSpline).
 
-    A run takes a held input, found in params, as constant over each step: steps that end on its jumps keep their order.
-    A jump within a step makes it of order 1; outside of jit a `JumpWarning` says so. `sweep(..., times=)` ends steps
-    at jumps at any distances, and `adaptive` finds them by itself. What is saved at a jump is the acceleration before
-    it; `interpolate` uses it for v after it too.
+    A run treats a held input in params as constant over each step. Steps that end on its jumps keep their order. A
+    jump within a step reduces the order to 1; outside of jit a `JumpWarning` says so. `sweep(..., times=)` ends
+    steps at jumps at any distances, and `adaptive` finds the jumps by itself. At a jump, the saved acceleration is
+    the one before it; `interpolate` also uses it for v after the jump.
 
-    Outside the samples the nearest end value is held. Differentiable in values, times and t.
-    An input enters a simulation only through its values at the steps: with a step shorter than dt the
-    reconstruction between the samples matters, and the cubic one is far better on smooth signals.
+    Outside the samples the nearest end value is held. Differentiable in values, times and t. A simulation sees an
+    input only through its values at the steps. If the step is shorter than dt, the reconstruction between the
+    samples matters, and the cubic one is far better for smooth signals.
 
     Returns:
         A `Sampled`: t -> a number, or (channels...).
 
     Raises:
-        ValueError, TypeError: too few samples, a non-positive dt, times that do not increase or are not as many as the
-            samples, both dt and times, an unknown order, values that are not real or not finite.
+        ValueError, TypeError: too few samples; dt not positive; times that do not increase or are not as many as the
+            samples; both dt and times; an unknown order; values that are not real or not finite.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> u = hhtjax.sampled(jnp.array([0.0, 1.0, 4.0, 9.0, 16.0]), dt=0.5)     # u(t) = 4 t^2
@@ -180,7 +180,7 @@ def sampled(values: Real, dt: Real = None, t0: Real = 0.0, order: int = 3, *, ti
 
 
 def _grid(values: Array, dt: Real, t0: Real, times: Real):
-    """times, dt and t0, checked, in the dtype of the values: either times, or the other two."""
+    """times, dt and t0, checked, in the dtype of the values: either times, or dt and t0."""
     if times is None:
         if is_array(dt) and dt.ndim and dt.shape == values.shape[:1]:
             raise TypeError("sampled: `dt` must be a number; received one for each sample: give times as `times=`.")
@@ -188,7 +188,7 @@ def _grid(values: Array, dt: Real, t0: Real, times: Real):
         require_number("sampled", "t0", t0, np.isfinite, "be finite")
         return None, *(jnp.asarray(x).astype(values.dtype) for x in (dt, t0))
     if dt is not None or not (is_real(t0) and is_concrete(t0) and np.ndim(t0) == 0 and t0 == 0):
-        raise ValueError(f"sampled: `times` must stand in the place of dt and t0; received dt={dt!r}, t0={t0!r} too.")
+        raise ValueError(f"sampled: give either `times`, or dt and t0; received times with dt={dt!r}, t0={t0!r}.")
     times = times if is_array(times) else np.asarray(times)
     if not is_real(times):
         raise TypeError(f"sampled: `times` must be real numbers; received an array of {times.dtype}.")
@@ -249,15 +249,15 @@ def _uneven_spline_slopes(rise: Array, widths: Array) -> Array:
 
 
 def band_limited(values: Real, dt: Real, *, factor: int = 8, t0: Real = 0.0) -> Sampled:
-    """The function of time through `values[k]` at t0 + k dt that holds no frequency above 1/(2 dt).
+    """The function of time through `values[k]` at t0 + k dt that contains no frequency above 1/(2 dt).
 
-    The samples less the line through the first and the last one, continued as an odd function, are a Fourier series.
-    It is evaluated `factor` times as densely, and joined by a cubic spline, whose own gain error is that of
-    `spline_gain_error` at dt/factor.
+    The line through the first and the last sample is subtracted. The rest, continued as an odd function, is a Fourier
+    series. It is evaluated at `factor` points per sample, and these are joined by a cubic spline, whose own gain error
+    is that of `spline_gain_error` at dt/factor.
 
     Args:
         values: (samples,) or (samples, channels...), real, at least 4. dt: sampling period, positive.
-        factor: points for each sample; with that many steps for each sample they are met exactly.
+        factor: points per sample. A run with that many steps per sample uses these points exactly.
         t0: time of the first sample.
 
     Outside the samples the nearest end value is held. Near a jump or a kink, and near the ends, the series rings.
@@ -266,7 +266,7 @@ def band_limited(values: Real, dt: Real, *, factor: int = 8, t0: Real = 0.0) -> 
         A `Sampled`: t -> a number, or (channels...).
 
     Raises:
-        TypeError, ValueError: as `sampled`; a factor that is no positive integer.
+        TypeError, ValueError: as `sampled`; a factor that is not a positive integer.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> u = jnp.sin(2 * jnp.pi * 0.4 * jnp.arange(400.0))                        # 2.5 samples a period
@@ -285,12 +285,12 @@ def band_limited(values: Real, dt: Real, *, factor: int = 8, t0: Real = 0.0) -> 
 def band_limited_motion(values: Real, dt: Real, cutoff: Real | None) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Position, velocity and acceleration at the samples of a measured motion, without frequencies above `cutoff`.
 
-    The series is that of `band_limited`, cut off and differentiated. At both ends its second derivative is zero, so
-    that accelerations are wrong within about one period of the cutoff.
+    The Fourier series of `band_limited` is cut off and differentiated. Its second derivative is zero at both ends, so
+    accelerations are wrong within about one period of the cutoff from the ends.
 
     Args:
         values: (samples,) or (samples, channels...), real, at least 4. dt: sampling period, s.
-        cutoff: Hz; noise below it is multiplied by up to (2 pi cutoff)^2 in the acceleration.
+        cutoff: Hz. Noise below it is amplified by up to (2 pi cutoff)^2 in the acceleration.
 
     Returns:
         Three arrays like values.
@@ -324,8 +324,8 @@ def _motion(values: Array, dt: Array, cutoff: Array):
 
 
 def _odd_series(values: Array):
-    """The line from the first sample to the last, as a function of how many equal parts it is evaluated in, and the
-    spectrum of the rest, continued as an odd function; of its frequencies the highest is 0."""
+    """The line from the first sample to the last, as a function of the number of equal parts at which it is evaluated;
+    and the spectrum of the rest, continued as an odd function. Its highest frequency is set to 0."""
     y = jnp.asarray(values)
     y = y if jnp.issubdtype(y.dtype, jnp.floating) else y.astype(jnp.result_type(float))
 
@@ -338,16 +338,16 @@ def _odd_series(values: Array):
 
 
 def spline_gain_error(frequency: Real, dt: Real, order: int = 3) -> float:
-    """Relative error of the amplitude of a harmonic of `frequency` that `sampled(..., order)` reconstructs.
+    """Relative amplitude error of a harmonic of `frequency` that is reconstructed by `sampled(..., order)`.
 
-        order 0: 1 - sinc(f dt), late by dt/2 besides,    order 1: 1 - sinc^2(f dt),
+        order 0: 1 - sinc(f dt), and a delay of dt/2,    order 1: 1 - sinc^2(f dt),
         order 3: 1 - 3 sinc^4(f dt)/(2 + cos(2 pi f dt)),    sinc x = sin(pi x)/(pi x)
 
     Args:
         frequency: in Hz, at most half the sampling rate. dt: sampling period in s. order: 0, 1 or 3.
 
     Returns:
-        A number; 0.01 is an amplitude that is off by 1 %.
+        A number; 0.01 means that the amplitude is off by 1 %.
 
     Raises:
         TypeError, ValueError: an argument out of its range.

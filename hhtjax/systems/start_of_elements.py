@@ -1,4 +1,4 @@
-"""The check that a start of a system of elements satisfies its constraints: without a matrix that is not sparse."""
+"""The check that a start of a system of elements satisfies its constraints, with sparse matrices only."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ ROUNDINGS = 1000  # of q, which nobody asks about
 
 
 def require_consistent_elements(caller: str, start: tuple, checked: tuple, consistent: float):
-    """An error if a start is farther than `consistent` from the constraints, or these from independence; tracers pass.
+    """Raises an error if a start violates the constraints by more than rounding, or if these are dependent; tracers
+    pass.
 
-    start: system, q0, v0, t0, params, z0. checked: what the caller names q0 and v0, and what they violate.
+    start: system, q0, v0, t0, params, z0. checked: the caller's names of q0 and v0, and what they violate.
     """
     examined = known_now(_examine_elements, *start)
     if examined is None:

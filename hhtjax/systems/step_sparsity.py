@@ -1,11 +1,12 @@
-"""Which unknowns of a step meet: from the nodes of elements, from a pattern, or from what the functions read.
+"""Which unknowns of a step are coupled: from the nodes of elements, from a pattern, or from what the functions read.
 
-With x the displacement of a step and eta what keeps the velocities of constraints, the equations of a step are
+With the displacement x of a step and the variable eta of the velocity constraints, the equations of a step are
 
     r(w, L, eta) = [M w - Q - B^T L;  Phi;  B v + Phi_t],    x = (...) + beta h^2 w',    w = w' + D eta
 
-in the unknowns (w', L, eta): eta enters velocities and accelerations, but no position, so that it meets only what its
-own constraint holds, and what dampers or a mass connect with that (see `hhtjax.steppers.constrained`).
+in the unknowns (w', L, eta). eta enters velocities and accelerations, but no position. So it is coupled only to the
+coordinates of its own constraint, and to those that dampers or a mass connect with these (see
+`hhtjax.steppers.constrained`).
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ if TYPE_CHECKING:
 
 
 class Sparsity:
-    """Patterns of a system on vectors.
+    """Sparsity patterns of a system on vectors.
 
-    force: (n, n), of M w - Q. drag: of that part of it that v and w enter. constraint: (m, n), None without. turning:
-    of `_turning`: the numbers of a rotation meet each other.
+    force: (n, n), of M w - Q. drag: of the part of it that depends on v and w. constraint: (m, n); None without
+    constraints. turning: of `_turning`: the three numbers of a rotation are coupled.
     """
 
     def __init__(self, force: csr_array, drag: csr_array, constraint: csr_array | None, blocks: tuple):
@@ -48,7 +49,7 @@ class Sparsity:
         return plan(product(self.constraint, self.constraint.T.tocsr()))
 
     def plan(self, size: int) -> Plan:
-        """The `Plan` for the unknowns w, (w, L) or (w, L, eta), told by their number."""
+        """The `Plan` for the unknowns w, (w, L) or (w, L, eta), which are distinguished by their number."""
         G, n = self.constraint, self.force.shape[0]
         if G is None or size == n:
             return plan(self.force)
@@ -87,7 +88,7 @@ def of_elements(parts: list[Elements], masses: list[Elements], joints: list[Join
 
 
 def _pairs(dofs: np.ndarray, n: int) -> csr_array:
-    """(n, n): all unknowns of each row of dofs with each other."""
+    """(n, n): all unknowns in a row of dofs are coupled."""
     from scipy.sparse import csr_array
 
     rows, columns = pairs_of(dofs)
@@ -101,7 +102,7 @@ def _reads_velocity(part: Elements, q: PyTree, v: PyTree, t: Any, params: PyTree
 
 
 def _joint_rows(joint: Joints, q: PyTree, v: PyTree, t: Any, params: PyTree, n: int) -> csr_array:
-    """(J m, n): each row with the unknowns of its joint."""
+    """(J m, n): each row is coupled to the unknowns of its joint."""
     from scipy.sparse import csr_array
 
     dofs = joint.dofs(v)
@@ -112,12 +113,12 @@ def _joint_rows(joint: Joints, q: PyTree, v: PyTree, t: Any, params: PyTree, n: 
 
 
 def _below(patterns: list) -> csr_array:
-    """One below the other."""
+    """The patterns stacked vertically."""
     return stacked([[pattern] for pattern in patterns])
 
 
 def detected(flat: FlatSystem, params: PyTree, dtype: np.dtype, pattern: csr_array | None = None) -> Sparsity:
-    """The `Sparsity` of a system from what its functions read. pattern: (n, n), in the place of what M w - Q reads."""
+    """The `Sparsity` of a system from what its functions read. pattern: (n, n), used instead of what M w - Q reads."""
     length = flat.blocks[-1].q.stop if flat.blocks else flat.positions
     x, *at = (jax.ShapeDtypeStruct(shape, dtype) for shape in ((flat.size,), (length,), ()))
     at = *at, jax.eval_shape(lambda x: x, params)  # of which no value counts
@@ -135,7 +136,7 @@ def detected(flat: FlatSystem, params: PyTree, dtype: np.dtype, pattern: csr_arr
         ) from None
     if reads.shape != (flat.size, flat.size):
         raise ValueError(
-            f"sparse_lu: `pattern` must have shape ({flat.size}, {flat.size}), as v has numbers; received shape "
+            f"sparse_lu: `pattern` must have shape ({flat.size}, {flat.size}), for the numbers in v; received shape "
             f"{reads.shape}."
         )
     return Sparsity(reads, drag, rows, flat.blocks)

@@ -1,4 +1,4 @@
-"""What is simulated: M(q) w = Q(q, v, t), with or without internal states, or y' = f(y, t): functions of pytrees."""
+"""System descriptions: M(q) w = Q(q, v, t), with or without internal states, and y' = f(y, t), on pytrees."""
 
 from __future__ import annotations
 
@@ -31,80 +31,82 @@ class System(Description):
     """A second-order mechanical system  M(q) w = Q(q, v, t)  with acceleration w.
 
     Args:
-        mass: M, the generalised mass matrix: `mass(q, params)`, or an array where M is constant; `mass(q, t, params)`,
-            its second argument named t, where it changes in time. (Q then holds -(dM/dt) v, if it is the rate of the
-            momentum M v that is known: `from_lagrangian` puts it there.)
-            Shape (n, n), symmetric positive definite, or (n,) for a diagonal. Its rows follow
-            `jax.flatten_util.ravel_pytree(v)`; for a dict that is the order of the *sorted* keys. What is no such
-            matrix is an error here if it is an array, and named by `Solution.check` if it is so where a run starts.
-        force: Q, the generalised force: `force(q, v, t, params)`, a pytree structured like v. Steps take its slopes,
-            derivatives of runs its second derivatives: a contact max(x, 0)**1.5, whose second one is infinite at 0,
-            gives NaN there, and max(x, 1e-12)**1.5 does not.
-        constraint: Phi with Phi(q, t) = 0, `constraint(q, t, params)` -> (m,), rows independent (or see `hht`). Then
-            M(q) w = Q + B^T L with B = dPhi/dq and multipliers L. For the steppers of the `hht` family.
-        inertia: M(q) w without M, `inertia(q, w, params)`, or `inertia(q, w, t, params)`, a pytree structured like v:
-            for chains and trees, whose
-            inverse dynamics take fewer operations than their matrix. It replaces the product of `mass` and w, in the
-            steps and in their Jacobians, and is trusted to be equal to it; `mass` is still asked for M itself.
-        dynamics: r, the whole residual as one function, in the place of `force` and `inertia`: inverse dynamics less
-            the forces that act, `dynamics(q, v, w, t, params)`, a pytree structured like v, with
+        mass: M, the generalised mass matrix: `mass(q, params)`, or an array if M is constant. If M changes in time,
+            write `mass(q, t, params)`; the second argument must be named t. (Q must then contain -(dM/dt) v if your
+            equation is the rate of the momentum M v; `from_lagrangian` adds this term.) Shape (n, n), symmetric
+            positive definite, or (n,) for a diagonal. Its rows follow `jax.flatten_util.ravel_pytree(v)`; for a dict
+            this is the order of the *sorted* keys. An array that is not such a matrix is an error here. For a function,
+            `Solution.check` reports a matrix that is not symmetric or not positive definite at the start of a run.
+        force: Q, the generalised force: `force(q, v, t, params)`, a pytree structured like v. Steps use its first
+            derivatives, and derivatives of runs its second derivatives. A contact force max(x, 0)**1.5 therefore gives
+            NaN: its second derivative is infinite at 0. Write max(x, 1e-12)**1.5 instead.
+        constraint: Phi with Phi(q, t) = 0, `constraint(q, t, params)` -> (m,), with independent rows (for dependent
+            rows see `hht`). The equation is then M(q) w = Q + B^T L with B = dPhi/dq and multipliers L. Only steppers
+            of the `hht` family support constraints.
+        inertia: the product M(q) w without M itself, `inertia(q, w, params)` or `inertia(q, w, t, params)`, a pytree
+            structured like v. Use it for chains and trees, whose inverse dynamics take fewer operations than their
+            matrix. It replaces the product of `mass` and w in the steps and in their Jacobians. That both agree is not
+            checked. `mass` is still needed, for M itself.
+        dynamics: r, the whole residual as one function, `dynamics(q, v, w, t, params)`, a pytree structured like v:
+            inverse dynamics minus the forces that act. It replaces `force` and `inertia`:
 
                 r(q, v, w, t) = M(q, t) w - Q(q, v, t)
 
-            It must be affine in w; a start with known numbers looks at that, once. The implicit steps then call nothing
-            else, and take its slopes by `jax.jacfwd`, or by the rule that it brings (`jax.custom_jvp`). Where M or Q is
-            asked for alone, at a start or by an explicit method, M is its slope in w and Q is -r(q, v, 0, t); `mass`
-            may be given beside it where it is known with fewer operations. With internal states it is `dynamics(q, v,
-            w, z, t, params)`.
-        internal: g, the rate of internal states z of first order, such as the current of a motor, the integral of a
-            controller, hysteresis, or a Maxwell branch: `internal(q, v, z, t, params)`, a pytree structured like z,
-            of any shapes. The force is then `force(q, v, z, t, params)`, and runs take a `z0`:
+            It must be affine in w; this is checked once, at a start with concrete numbers. The implicit steps call only
+            this function. They differentiate it by `jax.jacfwd`, or by its own rule (`jax.custom_jvp`) if it has one.
+            Where M or Q is needed alone, at a start or in an explicit method, M is the derivative of r with respect to
+            w, and Q is -r(q, v, 0, t). Give `mass` as well if it takes fewer operations. With internal states write
+            `dynamics(q, v, w, z, t, params)`; `mass` is then required.
+        internal: g, the rate of first-order internal states z: `internal(q, v, z, t, params)`, a pytree structured like
+            z, of any shapes. Examples: the current of a motor, the integral of a controller, hysteresis, a Maxwell
+            branch. The force is then `force(q, v, z, t, params)`, and runs take a `z0`:
 
                 M(q) w = Q(q, v, z, t) + B^T L,    zdot = g(q, v, z, t)
 
-            Both are solved at once, in one factorisation of their common size, to the order of the stepper, however
-            fast z is. (With alpha = 0, or rho_inf = 1, a fast z that starts off the values it is drawn to swings
-            about them for ever, as the trapezoidal rule does: damp, or start it there.) For the `hht` family,
-            Rosenbrock and Runge-Kutta methods. g should have bounded slopes: no relays, and |z|^nu at z = 0 has
-            derivatives in nu that are not finite, unless written exp(nu log(|z| + 1e-12)).
-        friction: F >= 0, the limits of dry friction, `friction(q, v, t, params)`, a pytree structured like v: of each
-            coordinate, 0 where nothing rubs; with `sliding` (m,), one for each of its rows. It is called with z behind
-            v where there are internal states, and with the multipliers L before t where there is a constraint, for
-            limits that depend on normal loads. The law is set-valued (Coulomb 1785):
+            Both equations are solved together, with one factorisation of their joint matrix, to the order of the
+            stepper, however fast z is. (With alpha = 0, or rho_inf = 1, a fast z that starts away from its equilibrium
+            oscillates about it without decay, as with the trapezoidal rule. Use a stepper with damping, or start z at
+            its equilibrium.) Supported by the `hht` family, Rosenbrock and Runge-Kutta methods. g must have bounded
+            derivatives, so no relays. The derivative of |z|^nu with respect to nu is not finite at z = 0; write exp(nu
+            log(|z| + 1e-12)) instead.
+        friction: F >= 0, the limits of dry friction: `friction(q, v, t, params)`, a pytree structured like v with one
+            limit for each coordinate, 0 where there is no friction. With `sliding` it returns (m,), one limit for each
+            row of `sliding`. With internal states it takes z after v. With a constraint it takes the multipliers L
+            before t, for limits that depend on normal loads. The law is set-valued (Coulomb 1785):
 
                 M(q) w = Q + B^T L - H^T tau,    tau = F sign(s) where s != 0,    |tau| <= F where s = 0
 
-            F(q, v, t) may be any continuous function, a Stribeck curve among them; its value at s = 0 is the stiction.
-            Friction that differs from one direction to the other, from -F1 to F2, is F = (F1 + F2)/2 with the constant
-            force (F1 - F2)/2 in `force`. For the `hht` family; see `hhtjax.systems`.
-        sliding: s, the sliding velocities, `sliding(q, v, t, params)` -> (m,), affine in v, H = ds/dv: relative
-            velocities of bodies, v - u(t) on a moving belt. Default: v itself. Where F is larger than all that comes,
-            s = 0 holds throughout: a constraint of velocities, as of a wheel that rolls. m <= 16, as each step solves
-            dense problems of m joints, several times, and its loops are as long.
+            F(q, v, t) may be any continuous function, such as a Stribeck curve; its value at s = 0 is the stiction. For
+            friction that differs between directions, from -F1 to F2, use F = (F1 + F2)/2 and add the constant force (F1
+            - F2)/2 to `force`. For the `hht` family; see `hhtjax.systems`.
+        sliding: s, the sliding velocities, `sliding(q, v, t, params)` -> (m,), affine in v, with H = ds/dv. Examples:
+            relative velocities of bodies, or v - u(t) on a moving belt. Default: v itself. If F is larger than every
+            force that occurs, s = 0 holds throughout: a velocity constraint, as for a rolling wheel. m <= 16, because
+            each step solves several dense problems of size m.
 
-            Rows may depend on each other, and on constraints: every joint of a closed loop may rub, both sides of a
-            gear, each joint of a mechanism with a driven crank, whose friction the multipliers then bear. The motion
-            is unique then, and the forces are not: where dependent joints stick, of all forces that give this motion,
-            |tau_i| <= F_i, the ones with the least sum of K_ii tau_i^2 are given, K = H M^-1 H^T with the constraints;
-            and 0 where a joint rests that can move nothing. Which of them a real joint bears no rigid model tells. The
-            derivatives of the motion are exact for those who stick and slide; single forces of dependent joints that
-            stick have derivatives that add up to the right ones, and no more. More rows than freedoms (n minus the rows
-            of `constraint`), or than 8, are taken to be dependent, and so are rows that the start shows to be. Rows
-            of which only a tracer tells, or that become dependent later, are named by `check()`:
-            `hht(redundant="least_squares")` is for these.
-        contact: a `Contact`: bodies in a plane that land on each other, rest, stick, slide and let go. For the `hht`
-            family; `run.contact` has the forces.
+            Rows may depend on each other and on constraints. All joints of a closed loop may have friction, or both
+            sides of a gear, or each joint of a mechanism with a driven crank (the multipliers then carry the friction).
+            The motion is then unique, but the friction forces are not. Where dependent joints stick, the result is the
+            set of forces that gives this motion, satisfies |tau_i| <= F_i, and has the least sum of K_ii tau_i^2, with
+            K = H M^-1 H^T (constraints included). A joint at rest that cannot move gets 0. A rigid model cannot tell
+            which force a real joint carries. Derivatives of the motion are exact while the same joints stick and slide.
+            Derivatives of single forces of dependent sticking joints are only correct in sum. Rows are treated as
+            dependent if there are more of them than freedoms (n minus the rows of `constraint`), if there are more than
+            8, or if the start shows that they are. `check()` reports rows whose dependence only shows in traced values,
+            or only later in the run; use `hht(redundant="least_squares")` for these.
+        contact: a `Contact`: bodies in a plane that collide, rest, stick, slide and separate. For the `hht` family;
+            `run.contact` holds the contact forces.
 
-    q and v are pytrees of the same structure and shapes; n is the number of entries of v. Only a rotation differs: a
-    leaf R (..., 3, 3) of q, from material to spatial components, has the material angular velocity Om (..., 3) as its
-    leaf of v, Rdot = R hat(Om); its rows of M and Q are moments in material components. Any consistent
-    units do. A System is frozen and hashable; constant arrays in it are leaves of a pytree.
+    q and v are pytrees of the same structure and shapes; n is the number of entries of v. The exception is a rotation:
+    a leaf R (..., 3, 3) of q maps material to spatial components. Its leaf of v is the material angular velocity Om
+    (..., 3), with Rdot = R hat(Om). Its rows of M and Q are moments in material components. Any consistent units work.
+    A System is frozen and hashable; its constant arrays are leaves of a pytree.
 
     Raises:
-        TypeError: a function is not callable (or an array, for `mass`), not hashable, or has other arguments;
-            `dynamics` beside `force` or `inertia`.
-        ValueError: a constant `mass` of a wrong shape, not finite, not symmetric or not positive definite; `sliding`
-            without `friction`.
+        TypeError: a function is not callable (or an array, for `mass`), is not hashable, or takes other arguments;
+            `dynamics` given together with `force` or `inertia`.
+        ValueError: a constant `mass` has a wrong shape, is not finite, not symmetric or not positive definite;
+            `sliding` without `friction`.
 
     Example: a pendulum of length 2 m, with q the angle from the downward vertical in rad.
 
@@ -132,7 +134,8 @@ class System(Description):
     >>> [round(float(x[-1, 0]), 3) for x in (solution.v, solution.z)]         # 2 kt/(kt^2 + 0.01 R), 0.01 v/kt
     [3.846, 0.077]
 
-    Example: a block of 1 kg on a spring, with dry friction of 1 N: it stops for good where the spring cannot move it.
+    Example: a block of 1 kg on a spring, with dry friction of 1 N. It stops for good where the spring force is below 1
+    N.
 
     >>> block = hhtjax.System(
     ...     mass=jnp.array([1.0]), force=lambda q, v, t, params: -9.0 * q, friction=lambda q, v, t, params: 1.0 + 0 * q)
@@ -140,7 +143,7 @@ class System(Description):
     >>> bool(solution.sticking[-1, 0]), round(float(solution.friction[-1, 0]), 4), round(float(solution.q[-1, 0]), 4)
     (True, -1.0, 0.1111)
 
-    Example: the pendulum again, by its inverse dynamics: the moment that the acceleration w needs.
+    Example: the pendulum again, by its inverse dynamics divided by m l: r = l w + g sin(q).
 
     >>> pendulum = hhtjax.System(dynamics=lambda q, v, w, t, params: params["l"] * w + 9.81 * jnp.sin(q))
     >>> pendulum.mass(jnp.array([0.5]), 0.0, {"l": 2.0}), pendulum.force(jnp.zeros(1), jnp.zeros(1), 0.0, {"l": 2.0})
@@ -184,29 +187,32 @@ class System(Description):
             object.__setattr__(self, "mass", mass)
 
     def _require_contact(self):
-        """An error for what is no contact, or stands beside dry friction."""
+        """Raises an error if `contact` is not a `Contact`, or if `friction` is given too."""
         if not isinstance(self.contact, Contact):
             raise TypeError(f"System: `contact` must be a Contact; received {self.contact!r}.")
         if self.friction is not None:
             raise NotImplementedError(
-                "System: leave out `friction` beside `contact`, whose own friction goes with its normal forces; dry "
-                "friction elsewhere can be a smooth force, such as F tanh(v/0.001), in `force`."
+                "System: give either `contact` or `friction`, not both; received both. A contact has friction of its "
+                "own, `Contact(friction=)`. For dry friction elsewhere use a smooth force in `force`, such as F "
+                "tanh(v/0.001)."
             )
 
     def _take_apart(self):
-        """`mass`, `force` and `inertia` by `dynamics`, for those who ask for one of them alone."""
+        """Derives `mass`, `force` and `inertia` from `dynamics`, for callers that need one of them alone."""
         z, dynamics = "" if self.internal is None else "z, ", self.dynamics
         assert dynamics is not None
         require_function("System", "dynamics", dynamics, f"dynamics(q, v, w, {z}t, params)")
         for name in ("force", "inertia"):
             given = getattr(self, name)
             if given is not None and getattr(given, "dynamics", None) is not dynamics:  # else dataclasses.replace
-                raise TypeError(f"System: `dynamics` holds what `{name}` says: give one of them; received both.")
+                raise TypeError(
+                    f"System: give either `dynamics` or `{name}`, which `dynamics` contains; received both."
+                )
         object.__setattr__(self, "force", DynamicsForce(dynamics))
         if self.mass is None and self.internal is None:
             object.__setattr__(self, "mass", DynamicsMass(dynamics))
         elif self.mass is None:
-            raise TypeError("System: `dynamics` with internal states needs `mass` beside it, which they do not enter.")
+            raise TypeError("System: `dynamics` with internal states needs `mass` too; received None.")
 
     @classmethod
     def from_lagrangian(
@@ -223,20 +229,20 @@ class System(Description):
 
             M(q, t) = d2L/dv2,    Q = F + dL/dq - (d2L/dv dq) v - d2L/dv dt
 
-        M may depend on the time: a hoisted load, a pendulum whose length is driven, a tank that runs empty. Its rate is
-        the last term of Q. Of a body that loses mass this is the equation where what leaves is at rest; where it keeps
-        the velocity of the body, add (dM/dt) v to `force`.
+        M may depend on time: a hoisted load, a pendulum whose length is driven, a tank that empties. The last term of Q
+        accounts for the rate of M. For a body that loses mass, the equation assumes that the leaving mass is at rest.
+        If it keeps the velocity of the body, add (dM/dt) v to `force`.
 
         Args:
-            lagrangian: L = T - V, `lagrangian(q, v, t, params)`, a scalar. T must be quadratic in v, as M is that of
-                v = 0: where it is not, `check` says so. Every coordinate needs a mass; `hhtjax.systems` has the ways
-                for one that has none.
-            force: F, the forces that no potential holds (damping, inputs): `force(q, v, t, params)`.
+            lagrangian: L = T - V, `lagrangian(q, v, t, params)`, a scalar. T must be quadratic in v, because M is
+                evaluated at v = 0; `Solution.check` reports an L for which it is not. Every coordinate needs a mass;
+                for coordinates without mass see `hhtjax.systems`.
+            force: F, the forces that are not in the potential (damping, inputs): `force(q, v, t, params)`.
             internal: as for `System`; then `force(q, v, z, t, params)`.
             friction, sliding, constraint, contact: as for `System`. (Events are arguments of `simulate`.)
 
         Returns:
-            A `System`, whose `mass(q, t, params)` and `inertia(q, w, t, params)` are those of L.
+            A `System` whose `mass(q, t, params)` and `inertia(q, w, t, params)` are derived from L.
 
         Raises:
             TypeError, ValueError: an argument of a wrong kind.
@@ -248,7 +254,7 @@ class System(Description):
         >>> float(spring.force(0.1, 0.0, 0.0, {"m": 2.0, "k": 30.0}))
         -3.0
 
-        Example: a load of 1 kg on a rope that is hoisted at 0.1 m/s; it swings the wider, the shorter the rope is.
+        Example: a load of 1 kg on a rope that is hoisted at 0.1 m/s. The swing grows as the rope shortens.
 
         >>> def lagrangian(angle, rate, t, p):
         ...     l = p["l"] - p["u"] * t
@@ -277,35 +283,35 @@ class System(Description):
         friction: Callable | None = None,
         sliding: Callable | None = None,
     ) -> System:
-        """A system of many small parts: elements between nodes, and joints between them.
+        """A system assembled from many small parts: elements between nodes, and joints between them.
 
-        Leaves of q and v have the nodes as their first axis, so that a plane frame has q = {"r": (N, 2), "theta":
-        (N,)}, and rotations are leaves (N, 3, 3). It is a `System` like all others. From where the parts are follows
-        which unknowns meet, and with that how steps of the `hht` family are solved: by an elimination along the nodes
-        where these can be put in a row, or in a ring, and by SuperLU where not. Its cost grows with the number of nodes
-        alone in the former. Jacobians are those of elements: nothing has to be set.
+        The first axis of every leaf of q and v counts the nodes: a plane frame has q = {"r": (N, 2), "theta": (N,)},
+        and rotations are leaves (N, 3, 3). The result is a `System` like any other. The connections between nodes show
+        which unknowns are coupled, and so how steps of the `hht` family are solved: by elimination along the nodes if
+        they form a row or a ring (the cost then grows linearly with the number of nodes), otherwise by SuperLU.
+        Jacobians are computed element by element. There is nothing to configure.
 
         Args:
-            *parts: `Elements`, whose forces add up, and `Joints`, whose rows are constraints: each L of them is a
-                reaction, in the order of the joints that are given.
-            mass: what sits at the nodes: an array (n,), or a pytree structured like v with a mass for each number, each
-                node, or one for all; or a function of params that gives one. Or `Elements` of a consistent mass, whose
-                function gives M w of one element, `function(q, w, params)`; or a list of both.
-            held: nodes that do not move freely, a dict from a node, or a tuple of nodes, to how they are held. True:
-                where they start. Booleans structured like a node, as {"r": True} or {"r": [False, True]}: these numbers
-                alone. A function (t, params): the position of the node, structured like q of it, from which velocity
-                and acceleration follow; a dict may leave keys out. What is held is no unknown: its row of `v` has the
-                acceleration that is known.
-            friction, sliding: as for `System`, of the whole. Steps with dry friction are solved with full matrices: up
+            *parts: `Elements`, whose forces are summed, and `Joints`, whose rows are constraints. Each row has one
+                multiplier in L, a reaction, in the order of the given joints.
+            mass: the mass at the nodes: an array (n,), or a pytree structured like v with a mass for each number, for
+                each node, or one for all; or a function of params that returns one. Or `Elements` with a consistent
+                mass matrix, whose function returns M w of one element, `function(q, w, params)`. Or a list of both.
+            held: nodes whose motion is prescribed, a dict from a node, or a tuple of nodes, to how it is held. True: at
+                its initial position. Booleans structured like a node, as {"r": True} or {"r": [False, True]}: only
+                these components. A function (t, params): the position of the node, structured like its q; velocity and
+                acceleration follow by differentiation; a dict may omit keys. Held components are not unknowns: their
+                rows of `v` contain the prescribed rates.
+            friction, sliding: as for `System`, for the whole system. Steps with dry friction use full matrices, for up
                 to 600 unknowns.
 
-        Internal states belong to a `System` of one function, with `hht(solve=sparse_lu())`.
+        Internal states are not supported here. Write one `System` and solve it with `hht(solve=sparse_lu())`.
 
         Returns:
             A `System`.
 
         Raises:
-            TypeError, ValueError: a part, a mass or what is held is of a wrong kind.
+            TypeError, ValueError: a part, `mass` or `held` has a wrong type, shape or value.
 
         References:
             M. Geradin, A. Cardona, Flexible Multibody Dynamics, Wiley 2001.
@@ -337,14 +343,15 @@ class System(Description):
 
 @dataclass(frozen=True, eq=False)
 class FirstOrderSystem(Description):
-    """The first-order system  y' = f(y, t), for every stepper: internal states without a position.
+    """The first-order system  y' = f(y, t), for every stepper.
 
-    `simulate` takes y0 as q0, no v0, and returns y as `solution.q`, y' as `solution.v`, no acceleration. On it
+    `simulate` takes y0 as q0, and no v0. It returns y as `solution.q`, y' as `solution.v`, and no acceleration. The
+    methods are
 
         hht(alpha), hht(alpha, iterations=None)     order 2 for every alpha (Jansen, Whiting, Hulbert 2000)
         kim_hht(alpha)                              y1 = y + h f/(1 - theta h f_y),  theta = (1/2 - alpha)(1 + alpha):
                                                     order 2 only where theta = 1/2, at alpha = 0, without explicit time
-        implicit_euler(), rk4()                     what their names say
+        implicit_euler(), rk4()                     as named
 
     Args:
         rate: f, `rate(y, t, params)`, a pytree structured like y.
@@ -355,7 +362,7 @@ class FirstOrderSystem(Description):
     References:
         Kim et al. (2019), Eq. 15-22; Jansen, Whiting, Hulbert, Comput. Methods Appl. Mech. Eng. 190 (2000).
 
-    Example: the highly damped equation of Kim et al., Sec. 3.2, with half the step that explicit Euler could take.
+    Example: the strongly damped equation of Kim et al., Sec. 3.2, at half the largest stable step of explicit Euler.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> decay = hhtjax.FirstOrderSystem(lambda y, t, params: -params["rate"] * y)
@@ -377,7 +384,8 @@ class FirstOrderSystem(Description):
 
 
 def _require_constraint(constraint: Callable):
-    """An error for what is no function constraint(q, t, params); for one of velocities with the way to it."""
+    """Raises an error unless it is a function constraint(q, t, params); explains what to do with velocity
+    constraints."""
     try:
         require_function("System", "constraint", constraint, "constraint(q, t, params)")
     except TypeError as error:
@@ -385,7 +393,7 @@ def _require_constraint(constraint: Callable):
         if code is None or "v" not in code.co_varnames[: code.co_argcount]:
             raise
         raise TypeError(
-            f"{error} Velocities that are held, as where a wheel rolls, are `sliding` with a large `friction`."
+            f"{error} For a velocity constraint, such as a rolling wheel, use `sliding` with a large `friction`."
         ) from None
 
 
@@ -393,7 +401,7 @@ AnySystem = System | LinearSystem | FirstOrderSystem  # what a run takes
 
 
 def require_system(caller: str, system: AnySystem, massless: bool = False):
-    """An error for what is no system, or has coordinates without mass where these are not possible."""
+    """Raises an error for anything but a system, and for coordinates without mass unless `massless`."""
     if not isinstance(system, (System, LinearSystem, FirstOrderSystem)):
         raise TypeError(f"{caller}: `system` must be a System, LinearSystem or FirstOrderSystem; received {system!r}.")
     if not massless:
@@ -401,24 +409,24 @@ def require_system(caller: str, system: AnySystem, massless: bool = False):
 
 
 def require_masses(caller: str, system: AnySystem, without: str):
-    """An error for coordinates without mass, with which something is not possible."""
+    """Raises an error if the system has coordinates without mass; `without` says what to do."""
     if system.massless is not None:
         raise NotImplementedError(
-            f"{caller}: the `M` of the system is singular, and coordinates without mass have no acceleration of their "
-            f"own: {without}."
+            f"{caller}: the `M` of the system is singular. Coordinates without mass have no acceleration of their "
+            f"own, so they are not supported here: {without}."
         )
 
 
 def require_smooth(caller: str, system):
-    """An error for dry friction and contact, whose forces are no functions of the state."""
+    """Raises an error for dry friction and contact, whose forces are not functions of q and v."""
     if system.contact is not None:
         raise NotImplementedError(
-            f"{caller}: `system` has contact, whose forces are no functions of q and v: leave `contact` out."
+            f"{caller}: `system` has contact, whose forces are not functions of q and v: leave `contact` out."
         )
     if system.friction is not None:
         raise NotImplementedError(
-            f"{caller}: `system` has dry friction, which is no function of q and v: leave `friction` out, or put a "
-            "smooth one into `force`."
+            f"{caller}: `system` has dry friction, which is not a function of q and v: leave `friction` out, or put "
+            "a smooth friction force into `force`."
         )
 
 
@@ -428,7 +436,7 @@ def require_smooth(caller: str, system):
 
 @dataclass(frozen=True)
 class LagrangianMass:
-    """M(q, t) = d2L/dv2, which no v enters: at v = 0."""
+    """M(q, t) = d2L/dv2, evaluated at v = 0, since it must not depend on v."""
 
     lagrangian: Callable
     is_lagrangian = True  # knows no rotations
@@ -440,7 +448,7 @@ class LagrangianMass:
 
 @dataclass(frozen=True)
 class LagrangianInertia:
-    """M(q, t) w, the derivative of the momentum dL/dv in the direction w: one column of the Hessian, not all."""
+    """M(q, t) w, the derivative of the momentum dL/dv in direction w. This avoids the full Hessian."""
 
     lagrangian: Callable
 
@@ -451,13 +459,13 @@ class LagrangianInertia:
 
 
 def lagrangian_product(lagrangian: Callable, q: Array, v: Array, w: Array, t: Real, params: PyTree) -> Array:
-    """d2L/dv2 w at a velocity."""
+    """The product (d2L/dv2) w at velocity v."""
     momentum = jax.grad(lambda v: lagrangian(q, v, t, params))
     return jax.jvp(momentum, (v,), (w,))[1]
 
 
 def mass_reads_velocity(lagrangian: Callable, q: Array, v: Array, t: Array, params: PyTree):
-    """Whether d2L/dv2 depends on v, so that L is none of a mass matrix; looked at where v enters it at all."""
+    """Whether d2L/dv2 depends on v, in which case L has no mass matrix. Evaluated only if v enters d2L/dv2 at all."""
     flat, unravel = ravel_pytree(v)
     some = jnp.asarray(1 + 0.618 * np.arange(flat.size) % 0.5, flat.dtype)
 
@@ -493,7 +501,7 @@ class LagrangianForce:
 
 @dataclass(frozen=True)
 class InternalLagrangianForce:
-    """The same where F depends on internal states z too."""
+    """As `LagrangianForce`, for an F that depends on internal states z too."""
 
     lagrangian: Callable
     force: Callable | None
@@ -509,7 +517,8 @@ class InternalLagrangianForce:
 
 @dataclass(frozen=True)
 class DynamicsMass:
-    """M(q, t), the slope of r in w, at v = 0. Of a position without rotations, whose rates are structured like it."""
+    """M(q, t), the derivative of r with respect to w at v = 0, for positions without rotations (v is structured like
+    q)."""
 
     dynamics: Callable
 
@@ -518,12 +527,12 @@ class DynamicsMass:
         return self.matrix(q, zero, unravel, t, params)
 
     def matrix(self, q: PyTree, zero: Array, unravel: Callable, t: Real, params: PyTree) -> Array:
-        """The same of any position. zero: (n,); unravel: of vectors of rates."""
+        """M(q, t) for any position. zero: (n,); unravel: from a vector of rates to their pytree."""
         v = unravel(zero)
         return linear_map(lambda x: ravel_pytree(self.product(q, v, unravel(x), t, params))[0], zero)
 
     def product(self, q: PyTree, v: PyTree, w: PyTree, t: Real, params: PyTree) -> PyTree:
-        """M(q, t) w. v: zeros."""
+        """The product M(q, t) w. v: zeros."""
         return jax.jvp(lambda w: self.dynamics(q, v, w, t, params), (v,), (w,))[1]
 
 
@@ -550,25 +559,25 @@ TIMES = "t", "time"  # names that an argument for the time may have
 
 
 def takes_time(function: Callable, before: int) -> bool:
-    """Whether a function takes t behind so many arguments, and before params: it tells by the name."""
+    """Whether the argument after the first `before` ones, and before params, is named t."""
     names = positional_names(function)
     named = len(names) > before + 1 and names[before].lstrip("_") in TIMES
     return named and takes(function, before + 2)  # a decorator may have filled it in
 
 
 def require_inertial(caller: str, name: str, function: Callable, before: tuple[str, ...]) -> None:
-    """An error for what is no function of these and params, nor one of these, t and params."""
+    """Raises an error unless the function takes the arguments `before` and params, or `before`, t and params."""
     more = ("t",) if callable(function) and takes_time(function, len(before)) else ()
     require_function(caller, name, function, f"{name}({', '.join((*before, *more, 'params'))})")
 
 
 def timed(function: Callable, before: int, t: Real) -> tuple:
-    """(t,) for a function that takes the time behind so many arguments, () for one that does not."""
+    """(t,) if the function takes the time after the first `before` arguments, else ()."""
     return (t,) if takes_time(function, before) else ()
 
 
 def mass_at(system: System, q: PyTree, t: Real, params: PyTree):
-    """M of a system with pytrees, as its user gave it: a function's value, or the constant array."""
+    """M of a system on pytrees, as the user gave it: a function's value, or the constant array."""
     return system.mass(q, *timed(system.mass, 1, t), params) if callable(system.mass) else system.mass
 
 

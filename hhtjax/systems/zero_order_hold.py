@@ -1,8 +1,8 @@
-"""Inputs that are held, `sampled(order=0)` in params: constant over a step, and a jump between two steps.
+"""Held inputs, `sampled(order=0)` in params: they are constant over a step, and jump between two steps.
 
-A step that ends on a jump must not see the new value at its end, nor the next one the old value at its start. So a step
-gets the value in its middle. Where a step ends on a sample of uneven times, the old value there is the one held until
-then. What the state takes along at a jump is in steppers/stepper.py, `behind_jump`.
+A step that ends on a jump must not use the new value at its end, and the next step must not use the old value at its
+start. Each step therefore uses the value in its middle. If a step ends on a sample of uneven times, the value before it
+is the one held until then. The change of the state at a jump is in steppers/stepper.py, `behind_jump`.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ OFF_GRID = 1e-6  # of a step, from which on a jump within it is told: what it co
 
 
 class JumpWarning(UserWarning):
-    """A held input jumps within a step, where the method has order 1, whatever its order is elsewhere."""
+    """A held input jumps within a step. The method then has order 1 there, whatever its order is elsewhere."""
 
 
 def warn_of_jumps(caller: str, params: PyTree, times: np.ndarray, steps: Callable, level: int):
-    """A `JumpWarning` where a held input jumps within a step, as far as all is known.
+    """Warns with a `JumpWarning` if a held input jumps within a step, as far as the values are known.
 
-    times: (K + 1,), at which steps of any size end. steps: H (J,), lengths between two of these -> how many equal steps
-    they are divided into, (J,), or (J, B) in B runs.
+    times: (K + 1,), at which steps of any size end. steps: H (J,), the lengths of intervals between two of these -> the
+    number of equal steps in each, (J,), or (J, B) in B runs.
     """
     for x in filter(_is_held, jax.tree.leaves(params, is_leaf=_is_held)):
         if not all_concrete((x, times)):
@@ -68,13 +68,14 @@ def before(params: PyTree, t: Array, dt):
 
 
 def passed(params: PyTree, t: Array, last: Array, dt: Array) -> Array:
-    """Whether a step dt from t has another sample of a held input than the one before, last, which ended there."""
+    """Whether the sample of a held input in a step dt from t differs from the one in the previous step, `last`, which
+    ended at t."""
     held = filter(_is_held, jax.tree.leaves(params, is_leaf=_is_held))
     return jnp.any(jnp.stack([x.place_before(t, last) != x.place(t + dt / 2) for x in held]))
 
 
 def jump_after(params: PyTree, t: Array) -> Array:
-    """The time of the first jump after t; inf where there is none."""
+    """The time of the first jump after t; inf if there is none."""
     leaves = jax.tree.leaves(params, is_leaf=_is_held)
     t = t + SLOP * float(jnp.finfo(t.dtype).eps) * jnp.abs(t)  # a jump that t is, in its dtype, is over
     times = [x.jump_after(t).astype(t.dtype) for x in leaves if _is_held(x)]
