@@ -1,8 +1,8 @@
-"""What the results of an operation depend on, where elements are told apart: a rule for each operation of JAX.
+"""Which elements of the results of an operation depend on which elements of its operands: a rule for each operation.
 
-A rule is a function (operation, *values) -> values of its results. It may take for dependent what is not, and never the
-reverse. An operation without a rule, or an option that a rule does not know, makes each result depend on all that any
-operand does (`all_on_all`).
+A rule is a function (operation, *values) -> values of its results. It may report a dependence that does not exist, but
+must not miss one. For an operation without a rule, or with an option that its rule does not support, each result
+depends on everything on which any operand depends (`all_on_all`).
 """
 
 from __future__ import annotations

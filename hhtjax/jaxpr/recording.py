@@ -1,7 +1,7 @@
-"""A function, traced and written as a list of operations on scalars: arrays of any size taken to pieces.
+"""Converts a traced function into a list of operations on scalars. Arrays of any size are taken apart.
 
-Rules of `scalar_rules.py` move elements, and tell what is done with them; here are calls, branches, loops, and what
-reads an array at an index that is not known. No derivative is taken of the list: what it holds is final.
+The rules of `scalar_rules.py` handle operations that move elements or compute with them. Calls, branches, loops, and
+reads of an array at an unknown index are handled here. The list is final: no derivative is taken of it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ INLINED = {  # a function called: the parameter that holds it
 
 
 class NotListed(Exception):
-    """An operation that cannot be in the list. name: its; line: of the user's that asked for it, or None."""
+    """An operation that cannot be listed. name: its name. line: the user's source line that needs it, or None."""
 
     def __init__(self, name: str, line=None):
         super().__init__(name if line is None else f"{name} ({line})")
@@ -53,18 +53,18 @@ class NotListed(Exception):
 
 
 def listed(f: Callable, *args: PyTree, whole: bool = False) -> Listing:
-    """f as a list of operations on scalars, with a scalar for each number of its arguments.
+    """Lists f as operations on scalars, with a scalar for each number of its arguments.
 
     Args:
-        f: a function of pytrees of arrays, to one.
-        *args: these; shapes and types matter, values do not.
-        whole: whether linear solves, and sines by polynomials, stay operations.
+        f: a function of pytrees of arrays that returns a pytree of arrays.
+        *args: its arguments. Only their shapes and types matter.
+        whole: whether linear solves, and sines by polynomials, stay single operations.
 
     Returns:
-        A `Listing`; its results are the tree that f returns, with object arrays of operands.
+        A `Listing`. Its results are the pytree that f returns, with object arrays of operands.
 
     Raises:
-        NotListed: with the name of an operation that it does not know, and where it comes from.
+        NotListed: an operation is not supported. It has the name of the operation and its source line.
 
     >>> import jax.numpy as jnp
     >>> found = listed(lambda x: 2 * jnp.sin(x), jnp.ones(3))

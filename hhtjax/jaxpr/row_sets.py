@@ -1,8 +1,8 @@
-"""Which unknowns each element of an array depends on: a sparse boolean matrix, a row for each element.
+"""Which unknowns each element of an array depends on: a sparse boolean matrix with a row for each element.
 
-A `Value` stands for an array in a program. Its rows tell what it depends on. Beside them it has what is known of its
-numbers: all of them, such as indices that are constants, or where they are zero, such as outside of the band of a
-matrix. Zeros count because 0 y does not depend on y.
+A `Value` represents an array of a program. Its rows show the unknowns on which its elements depend. It also has what is
+known of its numbers: all of them, such as constant indices, or where they are zero, such as outside the band of a
+matrix. Zeros matter because 0 y does not depend on y.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ DIRECTLY = 8  # steps of a closure before its matrix is squared
 
 
 class TooDense(Exception):
-    """A pattern with more entries than is sensible; a dense Jacobian is then no larger."""
+    """A pattern has so many entries that a dense Jacobian would not be larger."""
 
 
 @dataclass

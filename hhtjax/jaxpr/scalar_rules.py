@@ -1,7 +1,8 @@
-"""Arithmetic on arrays in pieces.
+"""Arithmetic on arrays that have been taken apart into scalars.
 
-What moves numbers about costs nothing. What is done with numbers is what the program says, IEEE, with the signs of
-zeros, NaN and infinities: only x * 1, x / 1, x - 0 and x + -0 are x. With structural zeros it is less.
+Moving elements costs nothing. Arithmetic follows the program exactly, in IEEE arithmetic with signed zeros, NaN and
+infinities: only x * 1, x / 1, x - 0 and x + -0 are replaced by x. With structural zeros more operations can be left
+    out.
 """
 
 from __future__ import annotations

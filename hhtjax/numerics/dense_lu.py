@@ -1,8 +1,9 @@
-"""Elimination for one dense matrix that XLA can fuse; LAPACK above a size.
+"""Elimination for a dense matrix that XLA can fuse, and LAPACK for large matrices.
 
-A call to LAPACK costs a microsecond on the CPU, several times a whole step of a small mechanism, so
-up to `UNROLLED` unknowns the elimination is written out as array operations, and up to `SCALAR` as scalar ones; up to
-`LOOPED` it is a loop in a kernel, and LAPACK's elsewhere. Hundreds are LAPACK's in panels.
+On the CPU a call to LAPACK costs a microsecond, several times a whole step of a small mechanism. So for up to `SCALAR`
+unknowns the elimination is written out as scalar operations, for up to `UNROLLED` as array operations. For up to
+`LOOPED` unknowns it is a loop inside a kernel, and LAPACK's elsewhere. Hundreds of unknowns are eliminated by LAPACK in
+panels.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""The solve of a step whose matrix is sparse: its entries from elements or products, and an elimination by blocks.
+"""Solves with the sparse matrix of a step: computation of its entries, and elimination by blocks or by SuperLU.
 
-A matrix is given as numbers, and a table of which of them add up to each entry. The numbers are those of elements, or
-products with a few vectors: one for each colour of the columns tells all entries. Where the unknowns can be put in a
-row of small blocks, as in chains, beams, cables and rings of them, the elimination is a loop over these that stays in
-the kernel; else it is SuperLU's, in an order found once.
+A matrix is given as numbers, and a table of the numbers that add up to each entry. The numbers are those of elements,
+or products of the matrix with a few vectors, one for each colour of its columns. If the unknowns can be arranged in a
+row of small blocks, as in chains, beams, cables and rings of them, the elimination is a loop over the blocks inside a
+kernel. Otherwise SuperLU is used, with an order of elimination that is found once.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""What a jaxpr holds that cannot be part of one kernel: asked before XLA is, which would fail on the whole program.
+"""Finds operations of a jaxpr that cannot be part of one kernel. XLA would fail on the whole program because of them.
 
-XLA:CPU compiles a call that bears `xla_cpu_small_call` into one function, with all its loops, if all that is in it is
-known to the emitter of such functions. LAPACK, sorting, scattering, large sums and products are not. Names here are
-those of JAX's operations; one that is not listed is taken for unknown: slower, never wrong.
+XLA:CPU compiles a call with the attribute `xla_cpu_small_call` into one function, with all its loops, if the emitter of
+such functions supports all its operations. It does not support LAPACK, sorting, scattering, large sums and products.
+The names here are those of JAX's operations. An operation that is not listed counts as unsupported: this can make a
+program slower, but never wrong.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""A jaxpr as a kernel needs it: with other operations in the place of those that XLA:CPU's emitter does not know.
+"""Rewrites a jaxpr for a kernel: replaces operations that XLA:CPU's emitter of kernels does not support.
 
-Products of small matrices become sums, large sums those of parts, scatters of few windows updates, sines of float64
-numbers polynomials; of a function in two forms (`choose`) the one for kernels is taken. All else is copied as it is,
-without being traced again.
+Products of small matrices become sums; large sums become sums of partial sums; scatters of few windows become updates;
+sines of float64 numbers become polynomials. Of a function in two forms (`choose`) the one for kernels is taken. All
+other operations are copied without being traced again.
 """
 
 from __future__ import annotations
