@@ -303,7 +303,7 @@ HELPERS = {
 {
     return isnan(a) ? 0 : (a < low ? low : (a > high ? high : a));
 }""",
-    "lu": """/* L below the diagonal and U on and above it: row i of a, its rows in the given order, is that of L U */
+    "lu": """/* replaces a by L (below the diagonal) and U: L U is a with its rows in the returned order */
 static void #_lu(const int n, @ *const a, int32_t *const pivots, int32_t *const order)
 {
     int i, j, k;
@@ -337,7 +337,7 @@ static void #_lu(const int n, @ *const a, int32_t *const pivots, int32_t *const 
         }
     }
 }""",
-    "triangular": """/* the x of a triangle of a, or of its transpose, in the place of its right-hand side */
+    "triangular": """/* solves with a triangle of a, or with its transpose; x: the right-hand side, then the result */
 static void #_triangular(const int n, const @ *const a, @ *const x, const int lower, const int transpose,
                          const int unit)
 {
@@ -353,8 +353,8 @@ static void #_triangular(const int n, const @ *const a, @ *const x, const int lo
         }
     }
 }""",
-    "svd": """/* s, u and the transpose of v with a = u diag(s) v^T, s falling: by rotations of columns in pairs until
-   they are orthogonal (Hestenes 1958), or nothing but rounding; what is not after so many sweeps is no number */
+    "svd": """/* s, u and the transpose of v with a = u diag(s) v^T and decreasing s: rotates columns in pairs until
+   they are orthogonal, or only rounding (Hestenes 1958); NaN if this takes too many sweeps */
 static void #_svd(const int n, const @ *const a, @ *const s, @ *const u, @ *const vt)
 {
     int i, j, k, sweep, turned = 1;
