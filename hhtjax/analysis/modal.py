@@ -68,8 +68,9 @@ def modes(M: Real, K: Real, count: int | None = None) -> NormalModes:
 
     Args:
         M, K: mass and stiffness, symmetric; M positive definite, K positive semidefinite. Arrays (n, n), or (n,) for
-            diagonals, or matrices of scipy.sparse of any size. Sparse matrices with more than 1000 rows are solved by
-            Lanczos's iteration on the shifted inverse (`scipy.sparse.linalg.eigsh`), all others by NumPy.
+            diagonals, or matrices of scipy.sparse of any size. Sparse matrices with more than 1000 rows, unless all
+            modes are asked for, are solved by Lanczos's iteration on the shifted inverse (`scipy.sparse.linalg.eigsh`),
+            all others by NumPy.
         count: number of modes; None for all.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What is done about first calls, which compile: programs are kept on disk, and who waits is told."""
+"""First calls, which compile: compiled programs are kept on disk, and a message explains a long wait."""
 
 from __future__ import annotations
 

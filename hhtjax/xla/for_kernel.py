@@ -563,7 +563,7 @@ def _passed_by(jaxpr: Jaxpr) -> dict:
 
 
 def _of_each(values: tuple):
-    """A sum of one element of each value, and the values that cannot be added. Returning each would need a buffer each."""
+    """A sum of one element of each value, and the values that cannot be added. Returning each would take a buffer."""
     terms, rest = [], []
     for x in values:
         if x.size and x.dtype in DTYPES:
