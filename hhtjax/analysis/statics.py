@@ -89,8 +89,8 @@ def equilibrium(
     found = _equilibrium(system, q0, v0, params, t0, z0)
     if all_concrete(found) and not found.converged:
         raise ValueError(
-            f"equilibrium: none was found near `q0`: {float(found.left):.3g} of the forces is left. Start nearer. A body "
-            "that moves freely, without springs, has no equilibrium."
+            f"equilibrium: none was found near `q0`: {float(found.left):.3g} of the forces is left. Start nearer. A "
+            "body that moves freely, without springs, has no equilibrium."
         )
     return found
 

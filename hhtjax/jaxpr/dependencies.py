@@ -107,7 +107,7 @@ def dependencies(f: Callable, x, *others: PyTree):
 
 
 def run(closed: ClosedJaxpr, values: Sequence[Value]) -> list[Value]:
-    """The values of the results of a jaxpr; each is forgotten where it is used for the last time."""
+    """The values of the results of a jaxpr. Intermediate values are deleted after their last use."""
     jaxpr, constants = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())
     found = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(_constant, constants), *values], strict=True))
     equations = needed(jaxpr)
@@ -260,7 +260,7 @@ def _cond(eqn, which: Value, *values: Value):
 
 
 def _independent(values: Sequence[Value], moves: Sequence[bool]) -> list[Value]:
-    """The same values with elements of those that move for unknowns, in their order."""
+    """The same values, with the elements of those that depend on the inputs as new unknowns, in their order."""
     n, start, found = sum(x.size for x, m in zip(values, moves, strict=True) if m), 0, []
     for x, move in zip(values, moves, strict=True):
         found.append(Value(x.shape, identity(x.size, n, start) if x.size else None) if move else x)
@@ -348,7 +348,7 @@ def _map(eqn, constants: Sequence[Value], rows: Sequence[Value]):
 
 
 def _written_out(eqn, constants: Sequence[Value], carry: Sequence[Value], rows: Sequence[Value]):
-    """Step by step, with all that is known in each."""
+    """A loop evaluated step by step, using the known numbers of each step."""
     found, count = {}, len(carry)
     steps = range(eqn.params["length"])
     for i in reversed(steps) if eqn.params["reverse"] else steps:
@@ -360,7 +360,7 @@ def _written_out(eqn, constants: Sequence[Value], carry: Sequence[Value], rows: 
 
 
 def _by_relation(eqn, constants: Sequence[Value], carry: Sequence[Value], rows: Sequence[Value]):
-    """All steps at once, by the relation of one."""
+    """A loop evaluated for all steps at once, from the relation of one step."""
     closed, count, length = eqn.params["jaxpr"], len(carry), eqn.params["length"]
     given = closed.jaxpr.invars[len(constants) :]
     moves = [[x.rows is not None for x in constants], _floating(given[:count]), [x.rows is not None for x in rows]]

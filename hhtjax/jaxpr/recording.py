@@ -231,7 +231,7 @@ def kept_and_carried(params: PyTree):
 
 
 def _counted(listing, params: PyTree, constants: tuple, start: tuple, avals: list):
-    """The same steps again and again as a `while` that counts them; None where that spares little."""
+    """Repeated equal steps as a `while` with a counter; None if that saves little."""
     recorder, carry = listing.recorder, [_fresh(listing.recorder, x) for x in avals]
     body = recorder.inside(lambda: _flat(listing.run(params["jaxpr"], [*constants, *carry])))
     if (params["length"] - 1) * sum(1 for _ in everywhere(body.operations)) <= WRITTEN_OUT:
@@ -305,7 +305,7 @@ def _map(recorder: Recorder, name: str, out, values: list):
 
 
 def _operand(recorder, x: np.ndarray):
-    """The one number that an array holds, or its name; None of what has neither."""
+    """The single number that an array holds, or its name; None if it has neither."""
     first = x.flat[0]
     if all(y.tobytes() == first.tobytes() if is_known(y) and is_known(first) else y is first for y in x.flat):
         return as_operand(first)
@@ -496,7 +496,7 @@ def _permutation(recorder, eqn, pivots):
 
 
 def _moved(recorder: Recorder, eqn: JaxprEqn, *values: np.ndarray):
-    """Of what moves elements, and does nothing else: asked where it takes their numbers."""
+    """The rule of an operation that only moves elements. It is applied to the numbers of the elements."""
     sizes = np.cumsum([0, *(x.size for x in values)])
     numbers = [np.arange(i, i + x.size, dtype=np.int32).reshape(x.shape) for i, x in zip(sizes, values, strict=False)]
     elements = np.concatenate([x.ravel() for x in values])
@@ -522,7 +522,7 @@ def _triangular_solve(recorder, eqn, A: np.ndarray, b: np.ndarray):
 
 
 def _compared(recorder, eqn, x, y):
-    """In the order in which what is no number comes last."""
+    """Comparison in the order in which NaN comes last."""
     pairs = zip(x.flat, y.flat, strict=True)
     return [arranged([recorder.record(eqn.primitive.name, bool, *pair) for pair in pairs], x.shape)]
 

@@ -122,7 +122,7 @@ def compute(name: str, *x: Array) -> Array:
 
 
 def recorder_of(x: tuple):
-    """Who records what is done with these scalars; None where they are JAX's, or known."""
+    """The recorder of these scalars; None if they are JAX arrays, or known numbers."""
     return next((y.recorder for y in x if isinstance(y, Scalar)), None)
 
 
@@ -485,7 +485,7 @@ def _structural(eqn, x: np.ndarray):
 
 
 def _moved(*moves: int):
-    """Of what moves elements to places that are known: asked where it takes the numbers of the elements.
+    """The rule of an operation that moves elements to known places. It is applied to the numbers of the elements.
 
     The numbers start at 1; what comes from outside an array is the fill value, 0.
     """

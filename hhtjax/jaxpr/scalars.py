@@ -80,7 +80,7 @@ def _traced(f: Callable, *args: PyTree):
 
 
 def _work(jaxpr):
-    """Number of operations on scalars, infinite with one that is not known; none for what only moves numbers."""
+    """Number of operations on scalars; infinite if one has no rule. Operations that only move numbers do not count."""
     total = 0
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
@@ -243,7 +243,7 @@ def in_stages(name: str, f: Callable, *args: Array):
 
 
 def _each_once(jaxpr: Jaxpr):
-    """The operations of a jaxpr without those on numbers that have been done before, and its results."""
+    """The operations of a jaxpr without repeated operations on the same numbers, and its results."""
     eqns, done, same = [], {}, {}
 
     def renamed(atoms: list):

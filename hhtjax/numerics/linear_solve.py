@@ -80,14 +80,14 @@ class Trusted:
     tolerance: Any = None
 
     def leaves(self, f: Callable, b: Array, x: Array) -> Array:
-        """What x leaves of b = f(x), relative to b."""
+        """The residual of b = f(x), relative to b."""
         largest = jnp.max(jnp.abs(b))  # whose square may be 0 in float32
         unit = jnp.where(largest == 0, 1, largest)
         left, size = (jnp.sqrt(jnp.sum((y / unit) ** 2)) for y in (f(x) - b, b))
         return lax.stop_gradient(jnp.where(left == 0, 0, left / size))
 
     def accepts(self, left: Array):
-        """Whether so much may be left; what is not a number is for others to tell."""
+        """Whether the residual is acceptable. NaN is accepted here, because other checks report it."""
         tolerance = self.tolerance
         return ~(left > (max(1e-6, 1e4 * float(jnp.finfo(left.dtype).eps)) if tolerance is None else tolerance))
 

@@ -103,7 +103,7 @@ class Plan:
 
     @cached_property
     def is_full(self) -> bool:
-        """Whether all blocks are of one size, and no fewer colours tell them than three for each place."""
+        """Whether all blocks have one size, and computing them takes no fewer colours than three for each place."""
         N, b = len(self.blocks.starts) - 1, self.blocks.size
         return self.is_in_blocks and N > 1 and N * b == self.n and self.colour.max() + 1 >= 3 * b
 
@@ -217,8 +217,8 @@ class Plan:
 
 
 def _row_scale(blocks: Blocks, free: np.ndarray) -> Array:
-    """(N, b): equations are measured by the square roots of their diagonal, and constraints by those of their unknowns,
-    so that no units choose the pivots; as of `factorize_saddle_point`."""
+    """(N, b): scales of the equations, as in `factorize_saddle_point`: square roots of their diagonal, and for
+    constraints those of their unknowns, so that the choice of pivots does not depend on units."""
     d = jnp.abs(_diagonals(blocks.middle))
     first = jnp.where(free, 1 / jnp.sqrt(jnp.where(d == 0, 1, d)), 0)
     if free.all():

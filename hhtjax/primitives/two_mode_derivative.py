@@ -118,7 +118,7 @@ def values(*x: Array, f: Callable):
 
 
 def _jvp_by(function, args, dots, **params):
-    """Found by autodiff."""
+    """Tangents by autodiff of the function."""
     found = jax.jvp(partial(function, **params), args, tuple(map(_instantiated, args, dots)))
     return found[0], [no_tangent(x) if x.dtype == jax.dtypes.float0 else x for x in found[1]]
 
