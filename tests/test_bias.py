@@ -228,7 +228,9 @@ def test_modes_are_told_apart_where_steps_move_them_onto_each_other():
     np.testing.assert_array_equal(
         np.isnan(hhtjax.step_size_bias(apart, hhtjax.wilson(), stiff, 1.0, q=jnp.zeros(4)).frequency), [0, 0, 0, 1]
     )
-    with pytest.raises(ValueError, match=r"`dt` must let every mode oscillate, for `correct`; .* in which 1 of 4 do"):
+    with pytest.raises(
+        ValueError, match=r"`dt` must let every mode oscillate, to use `correct`; .* with which 1 of 4 do"
+    ):
         hhtjax.step_size_bias(apart, hhtjax.wilson(), stiff, 1.0, q=jnp.zeros(4), correct=True)
 
 
@@ -249,7 +251,7 @@ def test_modes_are_told_apart_where_steps_move_them_onto_each_other():
         (
             lambda: hhtjax.refine(through, 1.0, hhtjax.hht(), 0.1, covariance=False),
             ValueError,
-            "refine: leave out `covariance`",
+            "refine: `covariance` must be True",
         ),
         (
             lambda: hhtjax.step_size_bias(spring, "hht", None, 0.1, q=jnp.zeros(1)),
@@ -279,7 +281,7 @@ def test_modes_are_told_apart_where_steps_move_them_onto_each_other():
         (
             lambda: hhtjax.step_size_bias(spring, hhtjax.hht(), {"k": 1.0, "c": 0.1}, 0.1, q=jnp.zeros(2)),
             ValueError,
-            r"step_size_bias: `q` must be of the size of the mass, 1; received shape \(2,\)",
+            r"step_size_bias: `q` must have as many numbers as the mass, 1; received shape \(2,\)",
         ),
         (
             lambda: hhtjax.step_size_bias(spring, hhtjax.hht(), {"k": 1.0, "c": 0.1}, 0.1, q=None),

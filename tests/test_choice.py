@@ -192,5 +192,5 @@ def test_the_time_of_a_call_is_that_of_a_run_that_succeeds(monkeypatch):
 
 
 def test_a_tolerance_that_none_reaches_is_said_with_what_each_did():
-    with pytest.raises(ValueError, match=r"no method keeps to the `tolerance`:\n  hht\(\): "):
+    with pytest.raises(ValueError, match=r"no method reaches the `tolerance`:\n  hht\(\): "):
         choose_stepper(RUBBED, 3.0 * jnp.ones(1), jnp.zeros(1), 0.3, duration=2.0, tolerance=1e-11)

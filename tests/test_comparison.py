@@ -122,7 +122,7 @@ def test_errors_on_segments_left_out_are_those_of_numpy():
             left = 2 * (X @ p - np.asarray(y))[out & (weights > 0)]
             assert found.held_out[i, fold] == pytest.approx(np.sqrt(np.mean(left**2)), rel=1e-6)
     assert found.chosen == "true"
-    assert "takes 'true'" in repr(found)
+    assert "chosen: 'true'" in repr(found)
     assert "behind the best" in found._repr_html_()
     ax = hhtjax.plot.held_out(found, unit="V")
     np.testing.assert_allclose(ax.lines[3].get_xdata(), found.cross_validated[[0, 2]])
@@ -245,7 +245,7 @@ def test_segments_without_residuals_are_none():
         found = hhtjax.compare(fits, residuals)
         assert found.held_out.shape == found.converged.shape == (2, segments)
         assert found.held_out.all()
-    with pytest.raises(ValueError, match=r"`folds` must leave two segments or more .* received 8, which leaves 1"):
+    with pytest.raises(ValueError, match=r"`folds` must give two or more segments .* received 8, which gives 1"):
         hhtjax.compare(fits, residuals, always=np.arange(10) < 8)
 
 
@@ -275,7 +275,7 @@ def test_what_cannot_be_compared_is_named():
     short = one._replace(residual=one.residual[:7])
     with pytest.raises(ValueError, match="same measurements; received 1600 of 'a', 7 of 'b' observations"):
         hhtjax.compare({"a": one, "b": short})
-    with pytest.raises(ValueError, match="compare: `residuals` must be of a, b; received a"):
+    with pytest.raises(ValueError, match="compare: `residuals` must have the keys a, b; received a"):
         hhtjax.compare({"a": one, "b": one}, {"a": residuals})
     with pytest.raises(ValueError, match="compare: `folds` must be an integer, 2 or more; received 1"):
         hhtjax.compare({"a": one, "b": one}, residuals, folds=1)
@@ -284,15 +284,15 @@ def test_what_cannot_be_compared_is_named():
     with pytest.raises(ValueError, match="compare: `fits` must have the same weights; those of 'a' and 'b' differ"):
         hhtjax.compare({"a": one, "b": one._replace(weights=2.0)})
     both = {"a": one, "b": one}
-    with pytest.raises(ValueError, match="compare: `absent` must be of parameters, rest, slow; received one for 'k'"):
+    with pytest.raises(ValueError, match="compare: `absent` must have keys among rest, slow; received 'k'"):
         hhtjax.compare(both, absent={"k": 1.0})
     with pytest.raises(ValueError, match=r"`residuals` of 'b' must be those fitted, \(1600,\); received \(1599,\)"):
         hhtjax.compare(both, {"a": residuals, "b": lambda p: residuals(p)[1:]})
-    with pytest.raises(ValueError, match=r"`residuals` of 'a' must be .* norm is .* received others, of 4\."):
+    with pytest.raises(ValueError, match=r"`residuals` of 'a' must be .* norm is .* received others, with norm 4\."):
         hhtjax.compare(both, lambda p: residuals(p) + 0.1)
     with pytest.raises(NotImplementedError, match=r"compare: `fits\['a'\]` has records"):
         hhtjax.compare({"a": one._replace(starts=jnp.ones((4, 1))), "b": one}, residuals)
-    with pytest.raises(ValueError, match="held_out: `found` has no errors on segments"):
+    with pytest.raises(ValueError, match="held_out: `found` must have errors on segments"):
         hhtjax.plot.held_out(hhtjax.compare({"a": one, "b": one}))
     with pytest.raises(TypeError, match="held_out: `found` must be a Comparison"):
         hhtjax.plot.held_out(one)

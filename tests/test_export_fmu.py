@@ -219,7 +219,7 @@ def test_the_same_model_is_the_same_unit(unit):
 
 def test_without_a_compiler_there_are_sources_and_a_warning(unit, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.warns(UserWarning, match="no C compiler here"):
+    with pytest.warns(UserWarning, match="no C compiler found"):
         path = unit.write(tmp_path)
     names = zipfile.ZipFile(path).namelist()
     assert "sources/driven.c" in names

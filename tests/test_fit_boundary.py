@@ -35,7 +35,7 @@ def rooted(p):
         (
             lambda: hhtjax.fit(lambda p: np.sin(p) + GOOD, 1.0),
             TypeError,
-            "traceable by JAX, with jax.numpy in place of",
+            "traceable by JAX: use jax.numpy instead of",
         ),
         (lambda: hhtjax.fit(lambda p: math.sin(p) + GOOD, 1.0), TypeError, "`residuals` must be traceable by JAX"),
         (lambda: hhtjax.fit(lambda p: p if p > 0 else -p, 1.0), TypeError, "`residuals` must be traceable by JAX"),
@@ -78,7 +78,7 @@ def rooted(p):
         (
             lambda: hhtjax.fit(rooted, 0.0, covariance=False),
             ValueError,
-            r"received a finite residual with a derivative that is not finite: roots, .* max\(x, 1e-12\) has\.$",
+            r"received a finite residual whose derivative is not finite: .* use max\(x, 1e-12\) for x there\.$",
         ),
         (
             lambda: hhtjax.fit(lambda p: 1e200 * p * jnp.ones(4), 2.0, covariance=False),

@@ -268,11 +268,11 @@ def test_bad_starts_and_bounds_are_named():
         hhtjax.bounded(2, 1)
     with pytest.raises(ValueError, match="bounded: a bound must be finite; received None and None"):
         hhtjax.bounded()
-    with pytest.raises(ValueError, match="bounded: `upper` must be finite, or inf for none; received nan"):
+    with pytest.raises(ValueError, match="bounded: `upper` must be finite, or inf for no bound; received nan"):
         hhtjax.bounded(0, np.nan)
     with pytest.raises(TypeError, match=r"bounded: `lower` must be a real number, an array of them, or None; .* '0'"):
         hhtjax.bounded("0", 1)
-    with pytest.raises(ValueError, match="multistart: `starts` must have one leading axis in all leaves"):
+    with pytest.raises(ValueError, match="multistart: `starts` must have the same leading axis in all leaves"):
         hhtjax.multistart(residuals, TRUE)
     with pytest.raises(ValueError, match="multistart: `starts` must hold at least one number"):
         hhtjax.multistart(residuals, jnp.zeros(0))

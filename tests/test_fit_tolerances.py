@@ -120,7 +120,7 @@ def test_a_fit_freezes_the_steps_and_chooses_again(name, most, residuals, measur
     fitted = hhtjax.fit(residuals[name], GUESS)
     assert fitted.converged
     assert 1 <= fitted.choices <= 3
-    assert f"; steps chosen {fitted.choices} times, and frozen" in fitted.summary()
+    assert f"; steps of the runs chosen {fitted.choices} times" in fitted.summary()
     assert hhtjax.FitResult.from_json(fitted.to_json()).choices == fitted.choices
     start = DUFFING, stepper, ONE, ZERO
     chosen = hhtjax.choose_steps(*start, fitted.params, times=TIMES, rtol=1e-4, atol=1e-7, max_steps=1000)

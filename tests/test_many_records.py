@@ -102,7 +102,7 @@ def test_what_cannot_be_shared_out_is_refused(threads):
     refused("give an `executor` or a `mesh`, not both", mesh=mesh)
     refused("`mesh` must be a jax.sharding.Mesh; received 3", TypeError, mesh=3, executor=None)
     refused("`chunk` must be a positive integer", chunk=0)
-    with pytest.raises(ValueError, match="shares out `records`, for Levenberg-Marquardt"):
+    with pytest.raises(ValueError, match="needs `records` and Levenberg-Marquardt"):
         hhtjax.fit(lambda params: params["k"] - np.ones(3), {"k": 1.0}, executor=threads)
     with pytest.raises(TypeError, match="call it outside jit, vmap and grad, on the CPU"):
         jax.jit(lambda k: hhtjax.fit(residuals, GUESS | {"k": k}, **FIT, executor=threads).params)(2.0)

@@ -225,7 +225,7 @@ def test_a_run_without_its_path_is_refused_by_name(short):
         short.check(reach=1.0)
     with pytest.raises(ValueError, match="energy_balance: `solution` must have q and v; received a run with output="):
         hhtjax.analysis.energy_balance(SPRING, short, START[2])
-    with pytest.raises(ValueError, match="measure: leave `output` out: the run was made with one"):
+    with pytest.raises(ValueError, match="measure: `output` must be left out: the run was made with output="):
         hhtjax.measure(short, 0.1, output=lambda q: q)
     with pytest.raises(
         NotImplementedError, match="interpolate: the output of a run with events is unknown at its events"

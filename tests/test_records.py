@@ -107,7 +107,7 @@ def test_bad_records_are_named():
 
     with pytest.raises(ValueError, match=r"fit: `records` and `starts` must be given together; .* by jax\.vmap\."):
         hhtjax.fit(residuals, GUESS, records=MEASURED)
-    with pytest.raises(ValueError, match=r"`starts` must have one leading axis in all leaves; .*\(2,\), \(3,\)"):
+    with pytest.raises(ValueError, match=r"`starts` must have the same leading axis in all leaves; .*\(2,\), \(3,\)"):
         hhtjax.fit(residuals, GUESS, records=MEASURED[:2], starts=STARTS)
-    with pytest.raises(ValueError, match="fit: `records` must go with Levenberg-Marquardt and without a prior"):
+    with pytest.raises(ValueError, match="fit: `records` must be used with Levenberg-Marquardt and without a prior"):
         hhtjax.fit(residuals, GUESS, records=MEASURED, starts=STARTS, prior=hhtjax.Gaussian(0.0, 1.0))

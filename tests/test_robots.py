@@ -46,7 +46,7 @@ def test_base_parameters_are_all_that_motions_tell():
     np.testing.assert_allclose(Y @ theta, Y[:, base.independent] @ (base.combination @ theta), atol=1e-9)
     with pytest.raises(TypeError, match="must be a Mechanism"):
         base_parameters(arm.system)
-    with pytest.raises(NotImplementedError, match="give `motion`"):
+    with pytest.raises(NotImplementedError, match="`motion` must be given"):
         base_parameters(random_tree(("ball",)))
 
 
@@ -116,5 +116,5 @@ def test_rows_that_may_stick_are_left_out_and_count_as_no_samples():
     np.testing.assert_allclose(np.asarray(kept[0])[np.asarray(kept[0]) != 0], first, rtol=1e-12)
     with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match=r"determine params\[1\] not at all"):
         hhtjax.fit(lambda F: [F[0] - first, F[1] * first[:0]], jnp.ones(2))  # as of a joint that rests throughout
-    with pytest.raises(ValueError, match="equation_error: `values` must slide somewhere"):
+    with pytest.raises(ValueError, match="equation_error: in `values` some joint with dry friction must slide"):
         hhtjax.equation_error(hhtjax.scenes.dry_oscillator.SYSTEM, np.zeros((99, 1)), dt, cutoff=5.0)

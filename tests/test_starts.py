@@ -97,7 +97,7 @@ def test_bad_input_is_named():
         flat = hhtjax.System(mass, lambda q, v, t, params: v)
         values = turned if many > 0 else turned["cart"].repeat(3, axis=1)[:, :5]
         assert hhtjax.equation_error(flat, values, 0.1, cutoff=1.0)(None).shape == (30, mass.size)
-    with pytest.raises(TypeError, match="measure: `solution` must be what simulate returns; received ArrayImpl"):
+    with pytest.raises(TypeError, match="measure: `solution` must be a Solution, from simulate; received ArrayImpl"):
         hhtjax.measure(jnp.ones(3), jnp.ones(3))
     for horizons, problem_at, message in (
         ((), lambda n, before: {}, "`horizons` must hold at least one; received none"),
@@ -105,7 +105,11 @@ def test_bad_input_is_named():
         ([5], lambda n: {}, r"`problem_at` is called as problem_at\(horizon, before\); .* 1 positional argument \(n\)"),
         ([5], lambda n, before: [jnp.sin], "`problem_at` must return a dict .* received at horizon 5 a list"),
         ([5], lambda n, before: {"weights": 1.0}, "`problem_at` must .* at horizon 5 weights, without residuals"),
-        ([5], lambda n, before: {"residuals": jnp.sin, "params0": 1.0}, "`problem_at` .* 5 'params0', which is none"),
+        (
+            [5],
+            lambda n, before: {"residuals": jnp.sin, "params0": 1.0},
+            "`problem_at` .* 5 'params0', which is not an argument",
+        ),
     ):
         with pytest.raises((TypeError, ValueError), match=f"^fit_progressively: {message}"):
             hhtjax.fit_progressively(problem_at, 1.0, horizons)

@@ -56,7 +56,8 @@ def test_intervals_cover_the_truth_where_few_segments_say_most():
     inside = (ends[:, :, 0] < np.array([0.0, 0.05])) & (ends[:, :, 1] > np.array([0.0, 0.05]))
     assert np.all(inside.mean(axis=0) > 0.93)  # 0.71 and 0.88 by as many degrees of freedom as there are segments
     noise = 0.1 * jax.random.normal(jax.random.key(0), (1600,))
-    assert "(cluster sandwich); worth 2 for params" in hhtjax.fit(lambda p: p - noise, 0.0, weights=present).summary()
+    text = hhtjax.fit(lambda p: p - noise, 0.0, weights=present).summary()
+    assert "(cluster sandwich); effective number of segments: 2 for params" in text
 
 
 @pytest.mark.slow

@@ -1,19 +1,19 @@
-"""What a step does to a motion: amplification, damping, periods, stability, order, energy; and the step it needs.
+"""Analysis of steps and runs: choice of stepper and step size, damping, periods, stability, order, energy, equilibria.
 
-A step of size h takes a small motion x to A x. The eigenvalues of this amplification matrix A, by automatic
-differentiation of the real step, tell everything about a linear vibration: their largest modulus, the spectral radius,
-whether it grows (above 1) and how much is left of it after one step; their logarithms, how much it is damped and how
-much slower it becomes. Where as many eigenvalues meet as there are no eigenvectors for, in a Jordan block, a motion
-grows before it decays, or for ever.
+`choose_stepper` recommends a stepper and its tolerances for a motion, `suggest_step_size` a step size. `observed_order`
+measures whether the error falls with the step size as it should. `energy_balance` gives the energy that the numerical
+method has added or removed. `equilibrium` finds where a system is at rest.
+
+The other functions describe one step. A step of size h maps a small motion x to A x. The amplification matrix A is
+computed by automatic differentiation of the real step. Its eigenvalues describe linear vibrations. Their largest
+modulus, the spectral radius, is the factor by which a vibration is multiplied in a step; above 1 it grows. Their
+logarithms give the numerical damping and the error of the period. If A has fewer eigenvectors than eigenvalues (a
+Jordan block), a motion grows before it decays, or for ever.
 
 >>> import hhtjax
 >>> stepper, wh = hhtjax.hht(alpha=-0.05), 0.3                                           # 21 steps in a period
 >>> f"{hhtjax.analysis.damping_ratio(stepper, wh):.1e} {hhtjax.analysis.period_elongation(stepper, wh):.1e}"
 '1.5e-04 8.5e-03'
-
-Which stepper a motion needs is answered by `choose_stepper`, which step by `suggest_step_size`; what a run made or lost
-by `energy_balance`; whether the error falls as it should by `observed_order`. `equilibrium` finds where a system is at
-rest.
 """
 
 from hhtjax.analysis.amplification import (

@@ -1,15 +1,17 @@
-"""What a step does to a linear motion: damping, periods, stability, order. All from the step itself, by autodiff.
+"""The effect of a step on a linear motion: damping, periods, stability. All from the real step, by autodiff.
 
-The tangent of one step, in increments scaled by the step size h so that its entries stay of order one for every h,
+The amplification matrix A is the derivative of one step. Increments are scaled by the step size h, so that the entries
+of A stay of order one for every h:
 
-    x = (q, h v, h^2 w, h^2 a, h^2 L, memory, z, h zdot, h za),    x1 = A x,
+    x = (q, h v, h^2 w, h^2 a, h^2 L, memory, z, h zdot, h za),    x1 = A x.
 
-has what a stepper carries: those fields of its `State` that are not None. On the test oscillator
+x has the fields of the stepper's `State` that are not None. On the test oscillator
 
     w = -2 zeta W v - W^2 q,    W = (natural frequency) h,  zeta: damping ratio,  h = 1,
 
-A depends on W and zeta only. A component that no later one depends on adds a column and an eigenvalue of zeros: w of
-the steppers with alpha_f = 0, for example. Without it, A is the matrix on (q, h v, h^2 a) of the literature.
+A depends only on W and zeta. A component on which the next step does not depend adds a zero column and a zero
+eigenvalue, for example w of the steppers with alpha_f = 0. Without it, A is the matrix on (q, h v, h^2 a) of the
+literature.
 
 Eigenvalues come from LAPACK, so these functions run on the CPU.
 
@@ -62,21 +64,22 @@ TEST_EQUATION = FirstOrderSystem(_complex_product)
 def amplification_matrix(
     system: AnySystem, stepper: Stepper, state: State, params: PyTree = None, *, dt: Real
 ) -> jax.Array:
-    """A, the derivative of one step at a state, with respect to x: (k, k).
+    """The amplification matrix A, (k, k): the derivative of one step at a state with respect to x,
 
-        x = (q, h v, h^2 w, h^2 a, h^2 L, memory, z, h zdot, h za),    of a first-order system (q, h v, h a, memory)
+        x = (q, h v, h^2 w, h^2 a, h^2 L, memory, z, h zdot, h za);    for a first-order system (q, h v, h a, memory).
 
-    Constrained or not: of a nonlinear system it is the tangent of the flow of the step, which near an equilibrium, or
-    for a small dt, tells how perturbations of the run grow. There each constraint adds the eigenvalues of infinite
-    frequency, whatever dt is. Fields that are None are left out, and so is memory that a step hands on unchanged, like
-    the tangent that `operator_splitting` keeps. Of a rotation, q is the displacement: R exp(q).
+    The system may be nonlinear or constrained. Near an equilibrium, or for a small dt, A shows how perturbations of a
+    run grow. Each constraint adds the eigenvalues of infinite frequency, for every dt. Fields that are None are left
+    out. So is memory that a step does not change, like the tangent that `operator_splitting` keeps. For a rotation, q
+    is the
+    displacement: R exp(q).
 
     Args:
         system, stepper, params, dt: as in `simulate`.
-        state: a `State`, of `stepper.init` or `stepper.step`; the first two steps of `houbolt` and `park` are those of
-            another method.
+        state: a `State`, from `stepper.init` or `stepper.step`. The first two steps of `houbolt` and `park` are those
+            of another method.
 
-    Differentiable; goes under jit and vmap.
+    The function is differentiable, and can be used under jit and vmap.
 
     Returns:
         A, (k, k).
@@ -131,7 +134,7 @@ def _amplification_matrix(system: AnySystem, stepper: Stepper, state: State, par
 
 
 def _floats(tree: PyTree):
-    """All but counters as a vector, and the function that puts such a vector beside these."""
+    """All floating numbers of a pytree as a vector, and the function that inserts such a vector again."""
     leaves, structure = jax.tree.flatten(tree)
     at = [i for i, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
     x, unravel = ravel_pytree([leaves[i] for i in at])
@@ -144,7 +147,7 @@ def _floats(tree: PyTree):
 
 
 def _tangent_part(blocks: tuple, q1: Array, like: PyTree) -> Array:
-    """A linear function of q1 whose derivative is the displacement of q1, through the transpose of `rate`."""
+    """A linear function of q1 whose derivative is the displacement of q1; computed with the transpose of `rate`."""
     at = jax.lax.stop_gradient(q1)
     rate = partial(kinematics.rate, blocks, at)
     transpose = jax.linear_transpose(rate, like)
@@ -161,14 +164,14 @@ def _carried(step: Callable, state: State, increments: State) -> np.ndarray:
 
 
 def oscillator_matrix(stepper: Stepper, frequency: Real, damping: Real = 0.0) -> jax.Array:
-    """A of the test oscillator, on (q, h v, h^2 w, h^2 a, memory) as far as the stepper carries them: (k, k).
+    """A of the test oscillator, (k, k), on those of (q, h v, h^2 w, h^2 a, memory) that the stepper's state has.
 
     Args:
-        stepper: any.
+        stepper: any stepper.
         frequency: W = (natural frequency) h, positive; jnp.inf for the limit.
         damping: zeta, the damping ratio.
 
-    Differentiable; goes under jit and vmap.
+    The function is differentiable, and can be used under jit and vmap.
 
     Returns:
         A, (k, k).
@@ -191,7 +194,7 @@ def oscillator_matrix(stepper: Stepper, frequency: Real, damping: Real = 0.0) ->
 
 
 def at_rest(system: AnySystem, stepper: Stepper, zero: Array, params: PyTree, dt: Real) -> State:
-    """The state of rest, behind the first steps of a stepper that begins with those of another method."""
+    """The state at rest, after the first steps if the stepper begins with another method."""
     v = None if isinstance(system, FirstOrderSystem) else zero
     state = begun("at_rest", system, stepper, zero, v, None, params, dt)
     for _ in range(stepper.first_steps):
@@ -215,9 +218,9 @@ def oscillator_params(caller: str, frequency: Real, damping: Real):
 
 
 def constraint_matrix(stepper: Stepper) -> jax.Array:
-    """A of one coordinate that a constraint holds, q = 0, on (q, h v, h^2 w, h^2 a, h^2 L): (5, 5), the same for all h.
+    """A of one coordinate with the constraint q = 0, on (q, h v, h^2 w, h^2 a, h^2 L): (5, 5), the same for all h.
 
-    On B q, B v, B w, B a any constrained system at an equilibrium has this matrix, once for each constraint. In the
+    Every constrained system at an equilibrium has this matrix on B q, B v, B w, B a, once for each constraint. In the
     index-3 form it is the limit of `oscillator_matrix`, with L = w. For HHT its eigenvalues are
 
         index3    alpha/(1 + alpha), and -(1 + alpha)/(1 - alpha) twice in one Jordan block: multipliers overshoot,
@@ -233,7 +236,7 @@ def constraint_matrix(stepper: Stepper) -> jax.Array:
         A, (5, 5).
 
     Raises:
-        TypeError: no stepper. NotImplementedError: one that cannot solve constraints.
+        TypeError: not a stepper. NotImplementedError: a stepper that does not support constraints.
 
     References:
         Cardona, Geradin (1989), Eq. 42.
@@ -265,13 +268,13 @@ def eigenvalues(stepper: Stepper, c: Array, k: Array) -> Array:
 
 
 def oscillator_roots(caller: str, stepper: Stepper, frequency: Real, damping: Real) -> Array:
-    """Eigenvalues of `oscillator_matrix`, after a check of what the user gave."""
+    """Eigenvalues of `oscillator_matrix`, after a check of the arguments."""
     require_stepper(caller, stepper)
     return eigenvalues(stepper, *oscillator_params(caller, frequency, damping))
 
 
 # ----------------------------------------------------------------------------
-# Checks of what the analyses are given.
+# Checks of arguments.
 
 
 def require_real(caller: str, name: str, value: Real, valid: Callable, expectation: str) -> Array:
@@ -296,11 +299,11 @@ def require_matrix(caller: str, matrix: Array) -> np.ndarray:
 
 
 # ----------------------------------------------------------------------------
-# Numbers and regions from the amplification matrix: radius, damping, period, overshoot, stability.
+# Quantities from the amplification matrix: spectral radius, damping, period, overshoot, stability region.
 
 
 def _principal_rate(caller: str, stepper: Stepper, frequency: Real, damping: Real) -> Array:
-    """log of the root that decays slowest, of those that oscillate; NaN where none does."""
+    """log of the slowest decaying eigenvalue among those that oscillate; NaN if none oscillates."""
     roots = oscillator_roots(caller, stepper, frequency, damping)
     slowest = jnp.argmax(jnp.where(roots.imag > 0, jnp.abs(roots), -1), axis=-1)
     principal = jnp.take_along_axis(roots, slowest[..., None], axis=-1)[..., 0]
@@ -308,17 +311,20 @@ def _principal_rate(caller: str, stepper: Stepper, frequency: Real, damping: Rea
 
 
 def spectral_radius(stepper: Stepper, frequency: Real, damping: Real = 0.0) -> jax.Array:
-    """Largest modulus of the eigenvalues of `oscillator_matrix`: of the shape of frequency and damping, broadcast.
+    """Spectral radius: the largest modulus of the eigenvalues of `oscillator_matrix`.
 
-    To 1e-10, up to W = 1e6. But at W > 1e4 three roots of `generalized_alpha` and of `kim_hht(0.0)` come close to each
-    other, and rounding in A leaves 1e-8 (1e-5 for rho_inf = 0); and a linearisation at the "state" rounds w to W^2 q.
-    At infinity, where roots meet (those of HHT in two), `jordan_structure` tells them to rounding.
+    In the long run it is the factor by which each step multiplies an oscillation. Above 1 the stepper is unstable.
+
+    It is accurate to 1e-10 up to W = 1e6, with exceptions. At W > 1e4 three eigenvalues of `generalized_alpha` and of
+    `kim_hht(0.0)` are close to each other, and rounding in A leaves an error of 1e-8 (1e-5 for rho_inf = 0). With a
+    linearisation at the "state", w is rounded to W^2 q. At infinity eigenvalues coincide (two for HHT):
+    `jordan_structure` computes them to rounding.
 
     Args:
-        stepper, frequency, damping: as in `oscillator_matrix`, or arrays of the last two.
+        stepper, frequency, damping: as in `oscillator_matrix`; frequency and damping may be arrays.
 
     Returns:
-        Of the shape of frequency and damping, broadcast.
+        An array with the broadcast shape of frequency and damping.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value.
@@ -331,16 +337,16 @@ def spectral_radius(stepper: Stepper, frequency: Real, damping: Real = 0.0) -> j
 
 
 def damping_ratio(stepper: Stepper, frequency: Real, damping: Real = 0.0) -> jax.Array:
-    """The damping ratio that the discrete oscillator has, -Re(r)/|r| with r = log(principal eigenvalue).
+    """Damping ratio of the oscillator in the steps: -Re(r)/|r| with r = log(principal eigenvalue).
 
-    For damping = 0 all of it is the method's. Of the eigenvalues that oscillate the principal one decays slowest; NaN
-    where none oscillates, as with the strongly damping methods at large frequencies.
+    For damping = 0 it is the numerical damping of the method. The principal eigenvalue is the slowest decaying one of
+    those that oscillate. The result is NaN if none oscillates, as for strongly damping methods at large frequencies.
 
     Args:
         stepper, frequency, damping: as in `spectral_radius`.
 
     Returns:
-        Of the shape of frequency and damping, broadcast; NaN where none oscillates.
+        An array with the broadcast shape of frequency and damping; NaN where no eigenvalue oscillates.
 
     Raises:
         TypeError, ValueError: as `spectral_radius`.
@@ -363,7 +369,7 @@ def period_elongation(stepper: Stepper, frequency: Real, damping: Real = 0.0) ->
         stepper, frequency, damping: as in `spectral_radius`.
 
     Returns:
-        Of the shape of frequency and damping, broadcast; NaN where none oscillates.
+        An array with the broadcast shape of frequency and damping; NaN where no eigenvalue oscillates.
 
     Raises:
         TypeError, ValueError: as `spectral_radius`.
@@ -377,16 +383,17 @@ def period_elongation(stepper: Stepper, frequency: Real, damping: Real = 0.0) ->
 
 
 def overshoot(stepper, frequency, damping=0.0) -> jax.Array:
-    """Largest factor by which the first step, from a start as in `simulate`, raises |(W q, h v)|, the root of energy.
+    """Largest factor by which the first step raises |(W q, h v)|, the square root of the energy.
 
-    At most 1 for the motion itself and for the trapezoidal rule. HHT overshoots in velocity, in proportion to W; such
-    a peak decays with the next steps, unlike what a spectral radius above 1 raises.
+    The step starts from a state as in `simulate`. For the exact motion and for the trapezoidal rule the factor is at
+    most 1. HHT overshoots in velocity, in proportion to W. Such a peak decays in the next steps, unlike growth due to a
+    spectral radius above 1.
 
     Args:
         stepper, frequency, damping: as in `spectral_radius`.
 
     Returns:
-        Of the shape of frequency and damping, broadcast.
+        An array with the broadcast shape of frequency and damping.
 
     Raises:
         TypeError, ValueError: as `spectral_radius`.
@@ -418,19 +425,20 @@ def _overshoot(stepper, c, k):
 
 
 def stability_region(stepper, z) -> jax.Array:
-    """Spectral radius of the step for y' = lambda y at z = h lambda, complex; stable where it is <= 1. Shaped like z.
+    """Spectral radius of the step for y' = lambda y at the complex numbers z = h lambda. It is stable where this is <=
+    1.
 
-    Of what y feels: not of the a of `kim_hht`, for example, whose recursion y never meets.
+    Components that do not influence y are left out, for example the a of `kim_hht`.
 
     Args:
-        stepper: any.
+        stepper: any stepper.
         z: complex or real numbers, an array of any shape.
 
     Returns:
-        Shaped like z.
+        An array shaped like z.
 
     Raises:
-        TypeError, ValueError: no stepper; z not of finite numbers.
+        TypeError, ValueError: not a stepper; z has numbers that are not finite.
 
     References:
         Kim et al. (2019), Eq. 15-22, Fig. 1-2.

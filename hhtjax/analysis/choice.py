@@ -1,4 +1,4 @@
-"""Which stepper a motion needs: what the system has, how stiff it is along the motion, and the error that is wanted."""
+"""The choice of a stepper, from the parts of the system, its stiffness along the motion, and the wanted error."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ METHODS = {
     "hht()": hht(),
 }
 STIFF = 4.0  # |lambda| h beyond which stable steps of an explicit method cost more; a step of dop853 is stable up to 6
-FEW = 12  # numbers of a state up to which a series is worth its first call, and its recurrences their work
-ROUGH = 1e-3  # tolerance from which on a method of order 5 is enough, of those that are explicit
-ROUGHEST = 1e-2  # from which on hht is enough, of those that know constraints
+FEW = 12  # numbers of a state up to which `taylor` is fast enough, its first call included
+ROUGH = 1e-3  # tolerance from which on an explicit method of order 5 is enough
+ROUGHEST = 1e-2  # tolerance from which on hht is enough for systems with constraints
 LINEARIZED_AT = 16  # samples
 LARGEST_STATE = 400  # rates, whose eigenvalues take a second
 FINEST = 1e-13  # rtol
 MOST_STEPS = 10_000, 100_000
-GROWN = 100.0  # times its size at first, up to which a motion is the scale of atol
-PARTS = 64  # of a duration: the longest steps where something may have been passed over
+GROWN = 100.0  # the scale of atol is the size of the motion, but at most this many times its initial size
+PARTS = 64  # of a duration: the longest steps if a run may have missed something
 TIMED = 3
 
 
@@ -58,17 +58,17 @@ class Tried(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """A stepper and its tolerances, for `simulate(system, choice.stepper, ..., dt=choice.dt, times=)`; as text, why.
+    """Result of `choose_stepper`, for `simulate(system, choice.stepper, ..., dt=choice.dt, times=)`; prints as text.
 
     Attributes:
         stepper: a `Stepper`.
         dt: `adaptive(rtol, atol)`.
-        error: estimated RMS error of q at the samples, relative to its motion about its mean.
-        seconds: of a call of `simulate` with so many samples, once it is compiled.
-        num_steps: accepted.
-        stiffness: |lambda| h: the largest rate in 1/s along the motion, times the mean step that the error alone asks
-            for; None where no explicit method was in question.
-        reason: in words.
+        error: estimated RMS error of q at the samples, relative to the RMS of q about its mean.
+        seconds: time of one call of `simulate` with as many samples, without compilation, s.
+        num_steps: number of accepted steps.
+        stiffness: |lambda| h: the largest rate in 1/s along the motion, times the mean step that accuracy alone would
+            allow; None if no explicit method was considered.
+        reason: reason for the choice, in words.
     """
 
     stepper: Stepper
@@ -102,11 +102,11 @@ def choose_stepper(
     t0: Real = 0.0,
     events: Sequence[Event] | None = None,
 ) -> Choice:
-    """The stepper for a motion, and the tolerances with which it keeps the error that is wanted.
+    """Chooses a stepper for a motion, and tolerances with which it reaches a wanted error.
 
-    A run with a method for stiff systems tells how long a step h the error alone asks for. At 16 of its samples the
-    system is linearised, as in `suggest_step_size`, and the mean of the largest |lambda| found; beyond 400 velocities
-    only at the last. Then
+    First, a run with a method for stiff systems gives the step size h that accuracy alone would allow. Then the system
+    is linearised at 16 samples of this run, as in `suggest_step_size`, and the largest |lambda| of each is averaged;
+    beyond 400 velocities it is linearised at the last sample only. The choice is
 
         dry friction                        hht()
         constraints or rotations            extrapolated(); hht(linearize="predictor") from a tolerance of 1e-2 on, and
@@ -115,28 +115,30 @@ def choose_stepper(
         nothing of these                    tsit5() from a tolerance of 1e-3 on; taylor() for 12 numbers of state or
                                             less; otherwise dop853()
 
-    and where a method does not know what the system has, has no series for its functions, or fails, the next of them.
-    These are the fastest of their kinds on the scenes of `python -m experiments work_precision`, which shows what each
-    choice costs beside the best one. The tolerance becomes smaller until two runs, at rtol and rtol/10, agree within
-    what is wanted; where the second takes no more steps than the first, it is made again with steps of at most 1/64 of
-    the duration. It takes as long as compiling two or three programs and some ten runs.
+    If a method does not support the system, has no series for its functions, or fails, the next method is tried. These
+    methods are the fastest of their kinds on the scenes of `python -m experiments work_precision`, which compares each
+    choice with the best method.
 
-    Where it fails: two runs that agree can both be wrong, as where a fast vibration is damped out of both, or both
-    pass over a short push; on chaos no two agree. Methods at constant steps are not tried: on linear systems, whose
-    matrix is factorised once then, and for motions of a few dozen steps they can be faster.
+    Then rtol is reduced until two runs, at rtol and rtol/10, agree within the tolerance. If the second run takes no
+    more steps than the first, it is repeated with steps of at most 1/64 of the duration. In total this takes as long as
+    compiling two or three programs, plus some ten runs.
+
+    Limits: two runs that agree can both be wrong. For example, both may damp out a fast vibration, or miss a short
+    push. On chaotic motions no two runs agree. Methods with constant steps are not tried. They can be faster on linear
+    systems, whose matrix they factorise only once, and for motions of a few dozen steps.
 
     Args:
         system, q0, v0, params, z0, t0, events: as in `simulate`.
         duration: s, positive.
-        tolerance: in (1e-13, 1), of the RMS error of q at the samples, relative to the motion of q about its mean.
-        num_samples: at equal distances; where errors are compared. extrapolated() ends a step at each.
+        tolerance: in (1e-13, 1): RMS error of q at the samples, relative to the RMS of q about its mean.
+        num_samples: number of equally spaced samples at which errors are compared. extrapolated() ends a step at each.
 
     Returns:
         A `Choice`, which prints as text.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; a q that does not move; a tolerance that no method
-            reaches, with what each of them did; JAX in single precision; called inside of jit, vmap or grad.
+            reaches (the message gives the failure of each); JAX in single precision; a call inside jit, vmap or grad.
         NotImplementedError: coordinates without mass; contact.
 
     >>> import jax.numpy as jnp, hhtjax
@@ -153,7 +155,9 @@ def choose_stepper(
     """
     caller = "choose_stepper"
     if getattr(system, "contact", None) is not None:
-        raise NotImplementedError(f"{caller}: with contact take hht(), and halve dt until the motion stays the same.")
+        raise NotImplementedError(
+            f"{caller}: `system` has contact: take hht(), and halve dt until the motion converges."
+        )
     params = _require(caller, system, params, (q0, v0, z0), duration, tolerance, num_samples, t0)
     tolerance, told = float(tolerance), []
     start = initial_values(caller, system, q0, v0, z0)
@@ -176,7 +180,7 @@ def choose_stepper(
     probe = _first(probes, lambda name: run(name, tolerance, 1e-2 * tolerance * _size(q0)).run, told)[1]
     motion, size = float(motion_of(_path(probe))), _size_at_first(probe, float(duration) / PARTS)
     if not motion > np.finfo(probe.t.dtype).eps * np.max(np.abs(_path(probe))):
-        raise ValueError(f"{caller}: `q0` does not move within {duration:g} s: there is no error relative to a motion.")
+        raise ValueError(f"{caller}: `q0` does not move within {duration:g} s, so the relative error is not defined.")
 
     stiffness = None
     if "tsit5()" in able and not sparse:
@@ -191,9 +195,9 @@ def choose_stepper(
 def _require(
     caller: str, system: AnySystem, params: PyTree, start: tuple, duration, tolerance, num_samples, t0: Real
 ) -> PyTree:
-    """params, checked; an error for what cannot be chosen for."""
+    """params, checked; raises an error for arguments for which no stepper can be chosen."""
     require_system(caller, system, massless=True)
-    require_masses(caller, system, "no error control knows them; take hht() and steps of one size")
+    require_masses(caller, system, "no error control supports them; take hht() and constant steps")
     if not all_concrete((start, params, duration, tolerance, t0)):
         raise TypeError(
             f"{caller}: the arguments must be known numbers; received a tracer: call it outside of jit, vmap and grad."
@@ -208,7 +212,7 @@ def _require(
 
 
 def _in_order(able: Sequence, system: AnySystem, stiffness: float | None, tolerance: float, numbers: int):
-    """The names of the methods that are able, best first, and why."""
+    """The names of the methods that support the system, best first, and the reason in words."""
     rest = ["rodas5p()", "extrapolated()", 'hht(linearize="predictor")']
     if system.friction is not None:
         names, reason = ["hht()"], "dry friction: only the hht family solves it"
@@ -217,37 +221,37 @@ def _in_order(able: Sequence, system: AnySystem, stiffness: float | None, tolera
         if tolerance >= ROUGHEST:
             names, reason = rest[::-1], reason + "order 2 is enough"
         elif "extrapolated()" in able:
-            reason += "the method of order 5 that knows them"
+            reason += "the method of order 5 that supports them"
         else:
-            reason += "only the hht family knows them and all else that there is"
+            reason += "only the hht family supports them together with the other parts of this system"
     elif stiffness is None:
-        names, reason = rest, "sparse matrices: taken as stiff"
+        names, reason = rest, "sparse matrices: assumed to be stiff"
     else:
-        steps = f"|lambda| h = {stiffness:.3g}, h the step that the error alone asks for"
+        steps = f"|lambda| h = {stiffness:.3g}, with h the step that accuracy alone would allow"
         if stiffness > STIFF:
-            names, reason = rest, f"stiff: {steps}; an explicit method needs shorter ones to be stable"
+            names, reason = rest, f"stiff: {steps}; an explicit method needs shorter steps to be stable"
         else:
             small = ["taylor()"] if numbers <= FEW else []
             names = [*(["tsit5()"] if tolerance >= ROUGH else [*small, "dop853()"]), *rest]
-            reason = f"not stiff: {steps}; explicit methods are stable with it up to some {STIFF:g}"
+            reason = f"not stiff: {steps}; explicit methods are stable up to about {STIFF:g}"
     return [name for name in names if name in able], reason
 
 
 def _first(names: Sequence, attempt: Callable, told: list):
-    """The first name whose attempt is neither refused nor fails, and what came of it; told: what of the others."""
+    """The first name whose attempt succeeds, and its result. told: a list to which the failures are added."""
     for name in names:
         try:
             return name, attempt(name)
         except (NotImplementedError, SimulationError) as error:
             told.append(f"{name}: {error}")
-    raise ValueError("\n  ".join(["choose_stepper: no method keeps to the `tolerance`:", *told]))
+    raise ValueError("\n  ".join(["choose_stepper: no method reaches the `tolerance`:", *told]))
 
 
 def _within(run: Callable, tolerance: float, motion: float, scale: float, name: str):
-    """The run with the largest rtol that keeps to the tolerance, and its error by one with a tenth of that.
+    """The run with the largest rtol that reaches the tolerance, and its error, from a second run with rtol/10.
 
-    atol is 1e-2 rtol of the scale. Where the second run takes no more steps, both may pass over the same: then it is
-    made again, with steps no longer than a PARTS-th of the whole.
+    atol is 1e-2 rtol times the scale. If the second run takes no more steps, both may have missed the same event. It is
+    then repeated with steps of at most a PARTS-th of the duration.
     """
     rtol, error = tolerance, np.inf
     now = run(name, rtol, 1e-2 * rtol * scale)
@@ -281,7 +285,7 @@ def _linearized(system: AnySystem, params: PyTree, q: PyTree, v: PyTree, z: PyTr
 def _is_able(
     system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree, events: Sequence[Event] | None, sparse: bool
 ) -> bool:
-    """Whether the method knows what the system has."""
+    """Whether the method supports the system and its events."""
     if (events and not stepper.meets_events) or (sparse and not stepper.keeps_sparse):
         return False
     try:
@@ -297,19 +301,21 @@ def _path(run: Solution) -> np.ndarray:
 
 
 def _size(q0: PyTree) -> float:
-    """The largest number of a position, or 1 where all are 0."""
+    """The largest absolute value of a position, or 1 if all are 0."""
     return max(float(np.max(np.abs(x), initial=0)) for x in jax.tree.leaves(q0)) or 1.0
 
 
 def _size_at_first(run: Solution, part: float) -> float:
-    """How far from 0 a number of q is at the start or the sample behind it, or comes at its first rate in that part of
-    the time; infinite where all is 0. Errors made at first, which may grow as the motion does, are small beside it."""
+    """Size of q at the start: the largest |q| at the first two samples, or `part` times the largest initial rate.
+
+    Infinite if all are 0. It limits atol, so that early errors, which may grow like the motion, stay relatively small.
+    """
     rates = max(float(np.max(np.abs(x[0]), initial=0)) for x in jax.tree.leaves(run.v))
     return max(float(np.max(np.abs(_path(run)[:-1][:2]))), part * rates) or np.inf
 
 
 def _numbers(*start: PyTree) -> int:
-    """How many numbers a state has."""
+    """Number of entries of a state."""
     return sum(np.size(x) for x in jax.tree.leaves(start))
 
 

@@ -1,4 +1,4 @@
-"""The order a stepper shows."""
+"""The order of convergence that a stepper shows on a system."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from hhtjax.xla import Programs
 
 @shown
 class ObservedOrder(NamedTuple):
-    """What `observed_order` found.
+    """Result of `observed_order`.
 
     Attributes:
         dt: step sizes (k,).
-        error: 2-norms of the error of q at the end, or of its change.
-        slope: between neighbours.
+        error: (k,), 2-norm of the error of q at the end; without a reference, of the change to the next finer run.
+        slope: (k - 1,), observed order between neighbouring step sizes.
     """
 
     dt: np.ndarray
@@ -46,17 +46,17 @@ def observed_order(
     reference: PyTree = None,
     t0: Real = 0.0,
 ) -> ObservedOrder:
-    """Order of convergence of q at t0 + duration, from runs with each of `num_steps` steps.
+    """Order of convergence of q at t0 + duration, from one run for each entry of `num_steps`.
 
     Args:
         system, stepper, q0, v0, params, z0, t0: as in `simulate`.
         duration: s. num_steps: increasing integers, such as (100, 200, 400).
-        reference: q at the end, like q0. Without it, what counts is the change from each run to the next, one number
-            less, with the same slope; num_steps must then be a geometric sequence.
+        reference: exact q at the end, like q0. Without it, the change from each run to the next replaces the error. It
+            has the same slope, and there is one fewer. num_steps must then be a geometric sequence.
 
     Returns:
-        An `ObservedOrder`. Slopes are dlog(error)/dlog(dt); they are worth something where dt resolves the motion and
-        the error is well above rounding.
+        An `ObservedOrder`. Slopes are dlog(error)/dlog(dt). They are meaningful where dt resolves the motion and the
+        error is well above rounding.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value.

@@ -1,4 +1,4 @@
-"""The energy of a run: what it holds, what forces put in and took out, and what the method made or lost."""
+"""The energy balance of a run: kinetic and potential energy, work of forces, and the energy error of the method."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 @shown
 class EnergyBalance(NamedTuple):
-    """Energies by saved time, (K + 1,) each, in J.
+    """Result of `energy_balance`: energies at the saved times, (K + 1,) each, in J.
 
     Attributes:
         t: s.
         kinetic: v' M v/2.
-        potential: V, 0 without.
-        work: of all other forces since the start, and of impacts.
-        error: kinetic + potential - their sum at the start - work, which the motion itself leaves at 0.
+        potential: V; 0 without `potential`.
+        work: work since the start of all forces without a potential, and of impacts.
+        error: kinetic + potential - their sum at the start - work. For the exact motion it is 0.
     """
 
     t: Array
@@ -47,11 +47,14 @@ class EnergyBalance(NamedTuple):
     error: Any
 
     def check(self, part: Real = 0.5):
-        """Raises `SimulationError` where energy has come from nowhere: `error` is more than this part of the largest
-        kinetic energy so far. So it is where a stiff spring stands for contact and the steps are too long for it: the
-        motion stays finite, and `Solution.check` sees nothing.
+        """Raises `SimulationError` if the method has created energy.
 
-        Not to be called inside jit. Of a batch the first bad member is told.
+        It does so if `error` exceeds `part` of the largest kinetic energy so far.
+
+        This happens, for example, if a stiff spring models contact and the steps are too long for it. The motion stays
+        finite, and `Solution.check` does not notice it.
+
+        Do not call it inside jit. In a batch the message names the first bad member.
 
         >>> import jax.numpy as jnp, hhtjax
         >>> wall = hhtjax.System(jnp.ones(1), lambda q, v, t, params: jnp.where(q < 0, -1e7 * q, 0 * q) - 9.81)
@@ -67,33 +70,39 @@ class EnergyBalance(NamedTuple):
         for member in np.argwhere(bad)[:1]:
             i, of = tuple(member), f" of member {tuple(map(int, member[:-1]))}" if len(member) > 1 else ""
             raise SimulationError(
-                f"energy_balance: by t = {t[i]:g} the method has made {error[i]:.3g} J{of}, of at most {most[i]:.3g} J "
-                "of kinetic energy: dt does not resolve a stiff force. Take a smaller one; where bodies meet, Contact."
+                f"energy_balance: by t = {t[i]:g} the method has made {error[i]:.3g} J{of}, with a kinetic energy of "
+                f"at most {most[i]:.3g} J so far: dt does not resolve a stiff force. Take a smaller dt. For bodies "
+                "that collide, use Contact."
             )
 
 
 def energy_balance(
     system: AnySystem, solution: Solution, params: PyTree = None, potential: Callable | None = None
 ) -> EnergyBalance:
-    """The energy balance along a run: a diagnostic, whose `error` is the energy that the method itself made or lost.
+    """The energy balance of a run. Its `error` is the energy that the numerical method has added or removed.
 
         d/dt (T + V) = v' Q + v' Mdot v/2 + L' B v - tau' H v + dV/dt = P,    T = v' M(q) v/2
         work(t) = integral of P:  dampers, inputs, forces without a potential, constraints that move, dry friction
 
-    The integral is Simpson's over each interval between saved times, on dense output: of order 4. Save every step, or
-    some within the shortest period. Dry friction tau jumps where a joint switches: its integral is of order 2 there.
-    It takes tau s where a joint slides, nothing where it sticks to what rests, and what a moving belt gives or takes.
-    What an impact takes from T is work; the integral ends there and begins anew, with an error of H^3 around it.
-    A switch of params it does not know: what that changes, in V or in forces, counts as error from there on.
-    Where nothing damps or drives, and V is given, work is 0 and the error is the drift of the total energy; without V,
-    work counts every force, and the error is another, of the same order.
+    The integral is by Simpson's rule over each interval between saved times, with dense output. It is of order 4. Save
+    every step, or several within the shortest period.
+
+    Dry friction tau jumps when a joint switches between sliding and sticking. There its integral is of order 2. Its
+    power is tau s where a joint slides and 0 where it sticks to a body at rest. The work of a moving belt is included.
+
+    The kinetic energy lost in an impact counts as work. The integral ends at the impact and begins again after it, with
+    an error of H^3 around it. Switches of params by events are not known here: their change of V, or of forces, counts
+    as error from then on.
+
+    If nothing damps or drives the system and V is given, the work is 0, and the error is the drift of the total energy.
+    Without V the work includes every force, and the error is a different one of the same order.
 
     Args:
         system, params: as in `simulate`; no `FirstOrderSystem`.
-        solution: of one run (vmap this function for a batch).
-        potential: V, `potential(q, t, params)`, a scalar in J, of forces that are part of the system's; None for 0.
+        solution: solution of one run (vmap this function for a batch).
+        potential: V, `potential(q, t, params)`, a scalar in J, of some or all forces of the system; None for 0.
 
-    Differentiable; goes under jit.
+    The function is differentiable and can be used under jit.
 
     Returns:
         An `EnergyBalance`.
@@ -102,7 +111,7 @@ def energy_balance(
         TypeError, ValueError: an argument of a wrong kind.
         NotImplementedError: a system with contact.
 
-    Example: a damped spring, started with 2 J, after 1 s: both energies, what the damper took, what HHT made.
+    Example: a damped spring, started with 2 J, after 1 s: kinetic and potential energy, work of the damper, and error.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -4.0 * q - 0.5 * v)
@@ -118,7 +127,7 @@ def energy_balance(
         raise ValueError(f"{caller}: `solution` must be of one run (vmap over a batch); received {solution!r}.")
     require_path(caller, solution)
     if system.contact is not None:
-        raise NotImplementedError(f"{caller}: `system` has contact, whose friction and impacts it does not balance.")
+        raise NotImplementedError(f"{caller}: `system` has contact, whose friction and impacts are not supported.")
     if potential is not None:
         require_function(caller, "potential", potential, "potential(q, t, params)")
         potential = current(potential)
@@ -134,13 +143,13 @@ def _energy_balance(system, solution: Solution, params: PyTree, potential) -> En
 
 
 def _balance(system, solution: Solution, run: Solution, across, params: PyTree, potential) -> EnergyBalance:
-    """At the times of the run, the solution with its events, if it has some; across: whether an interval is one."""
+    """The balance at the times of `run`, the solution with rows for its events. across: which intervals are events."""
     q0, v0, t0, z0 = (jax.tree.map(lambda x: x[0], y) for y in (solution.q, solution.v, solution.t, solution.z))
     params = thaw(params)
     flat, _, _ = flatten("energy_balance", system, q0, v0, t0, params, z0)
 
     def along(v: Array, forces: Array) -> Array:
-        """What forces do with the velocities, internal states left out: v' Q."""
+        """Power v' Q of forces, without internal states."""
         return jnp.dot(flat.located(v), flat.located(forces))
 
     def energies(q: Array, v: Array, t: Array):
@@ -148,7 +157,7 @@ def _balance(system, solution: Solution, run: Solution, across, params: PyTree, 
         return along(v, flat.inertia(q, v, t, params)) / 2, jnp.asarray(V).astype(t.dtype)
 
     def power(q: Array, v: Array, t: Array, L, params: PyTree) -> Array:
-        """P, without dry friction; derivatives along the motion by the chain rule, q at the rate qdot and v held."""
+        """P without dry friction. Derivatives along the motion are by the chain rule, with v held constant."""
         motion = flat.rate(q, v), jnp.ones_like(t)
         _, (T_q, V_dot) = jax.jvp(lambda q, t: energies(q, v, t), (q, t), motion)
         P = along(v, flat.force(q, v, t, params)) + T_q + V_dot
@@ -160,7 +169,7 @@ def _balance(system, solution: Solution, run: Solution, across, params: PyTree, 
     ends, middles = _points(flat, solution, run, params)
 
     def over_interval(first: tuple, between: tuple, last: tuple, H: Array) -> Array:
-        """Simpson's rule; a held input has the value that it has inside."""
+        """Simpson's rule; a held input has its value inside the interval."""
         inside = zero_order_hold.held_at(params, between[2])
         P, P_middle, P_end = (power(q, v, t, L, inside) for q, v, t, L in (first, between, last))
         return H / 6 * (P + 4 * P_middle + P_end)
@@ -175,7 +184,7 @@ def _balance(system, solution: Solution, run: Solution, across, params: PyTree, 
 
 
 def _summed(t: Array, T: Array, V: Array, work: Array, across) -> EnergyBalance:
-    """The balance, from the work in each interval; that of an impact is all that T loses."""
+    """The balance, from the work in each interval; the work of an impact is the change of T."""
     if across is not None:
         work = jnp.where(across, jnp.diff(T), work)
     work = jnp.concatenate([jnp.zeros_like(t[:1]), jnp.cumsum(work)])
@@ -183,7 +192,7 @@ def _summed(t: Array, T: Array, V: Array, work: Array, across) -> EnergyBalance:
 
 
 def _points(flat: FlatSystem, solution: Solution, run: Solution, params: PyTree):
-    """q, v and t at the saved times of the run, which is the solution with its events, and q, v, t and L between."""
+    """q, v and t at the saved times of `run`, and q, v, t and L in the middle between them."""
     t, L = run.t, run.multipliers
     H, middle = jnp.diff(t), (t[1:] + t[:-1]) / 2
     jumps = zero_order_hold.holds(params) or (switches(run) if flat.friction else False)
@@ -194,7 +203,7 @@ def _points(flat: FlatSystem, solution: Solution, run: Solution, params: PyTree)
 
 
 def _between(solution: Solution, run: Solution, H: Array, middle: Array, jumps):
-    """Positions and rates in the middle of each interval, of length H; jumps: whether, or where, accelerations do."""
+    """Positions and rates in the middle of each interval of length H. jumps: whether, or where, accelerations jump."""
     found = interpolate(solution, middle)
     rates = _vectors((found.v, found.z))
     if jumps is not False:  # of the cubic through q and v the slope
@@ -211,18 +220,18 @@ def _vectors(tree: PyTree) -> Array:
 
 
 # ----------------------------------------------------------------------------
-# A run whose events are saved times, too.
+# A run with additional rows before and after each event.
 
 
 VALUES = "t", "q", "v", "acceleration", "multipliers", "z", "zdot", "friction", "sticking"
 
 
 def with_event_rows(solution):
-    """The `Solution` with a row before and a row behind each event, in the order of time; between which rows an event
-    lies, and the places of the rows that were saved.
+    """(solution, across, saved): the `Solution` with a row before and a row after each event, in the order of time.
 
-    What an event does not tell is there as at the saved time before it, and behind it. Where `events` has room left,
-    the last row repeats.
+    across: which intervals between rows are an event. saved: places of the rows that were saved. Fields that an event
+    does not record have their values at the saved times before and after it. Unused places of `events` repeat the last
+    row.
     """
     events, last = solution.events, solution.t.shape[0] - 1
     met = ~jnp.isnan(events.t)
@@ -257,22 +266,23 @@ def _alternating(x, y):
 
 
 def directions_of(solution):
-    """In which direction each joint slides: (K + 1, m), 0 where it sticks."""
+    """Sliding direction of each joint: (K + 1, m), 0 where it sticks."""
     return jnp.where(solution.sticking, 0, jnp.sign(solution.friction))
 
 
 def switches(solution):
-    """Whether some joint switches in an interval: (K, 1)."""
+    """Whether any joint changes its sliding direction in an interval: (K, 1)."""
     sig = directions_of(solution)
     return jnp.any(sig[1:] != sig[:-1], axis=1, keepdims=True)
 
 
 def friction_work(flat, solution, ends, middles, w, params: PyTree):
-    """What dry friction did to the system in each interval, minus the integral of tau' H v: (K,).
+    """Work of dry friction on the system in each interval: minus the integral of tau' H v, (K,).
 
-    H v = s + c, where c is the speed of what a joint rubs on. Joints that keep on: Simpson's rule, with the limit in
-    the middle where they slide. Of one that switches, s goes to 0 at theta h and on from there, both linearly, over
-    the distance d; and the jump of w, which is not in the change of v, tells the mean of tau, for c:
+    H v = s + c, with the speed c of the surface on which a joint rubs. For a joint that does not switch, it uses
+    Simpson's rule, with the friction limit in the middle if it slides. For a joint that switches, s is assumed to go
+    linearly to 0 at theta h, and linearly on from there, over the distance d. The part of c needs the mean of tau,
+    which follows from the jump of w that does not appear in the change of v:
 
         integral tau s = h (theta tau0 s0 + (1 - theta) tau1 s1)/2,    d = h (theta s0 + (1 - theta) s1)/2
         mean tau = (tau0 + tau1)/2 + K^-1 H [(w0 + w1)/2 - (v1 - v0)/h],    K = H G
@@ -287,7 +297,7 @@ def friction_work(flat, solution, ends, middles, w, params: PyTree):
 
 
 def _power(flat, params: PyTree, first, middle, last, unseen):
-    """The mean of tau' H v over an interval; a held input has the value that it has inside."""
+    """The mean of tau' H v over an interval; a held input has its value inside the interval."""
     (*_, tau0, sig0), (q, v, t, L), (*_, tau1, sig1) = first, middle, last
     params = zero_order_hold.held_at(params, t)
     places = first[:3], (q, v, t), last[:3]
@@ -308,5 +318,5 @@ def _power(flat, params: PyTree, first, middle, last, unseen):
 
 
 def _simpson(x):
-    """The mean over an interval, of values at its ends and in its middle."""
+    """The mean over an interval, by Simpson's rule, from values at its ends and in its middle."""
     return (x[0] + 4 * x[1] + x[2]) / 6

@@ -1,4 +1,4 @@
-"""Multiple eigenvalues, and what powers of a matrix do before they decay."""
+"""Multiple eigenvalues, and the growth of the powers of a matrix before they decay."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from hhtjax.description import Real
 
 
 class Eigenvalue(NamedTuple):
-    """An eigenvalue, and how many eigenvectors belong to it.
+    """An eigenvalue, and the sizes of its Jordan blocks.
 
     Attributes:
         value: a complex number.
-        blocks: the sizes of its Jordan blocks, the largest first. Only blocks of 1: as many eigenvectors.
+        blocks: sizes of its Jordan blocks, largest first. Each block has one eigenvector.
     """
 
     value: complex
@@ -24,22 +24,24 @@ class Eigenvalue(NamedTuple):
 
 
 def jordan_structure(matrix: Real, tolerance: Real = 1e-3) -> tuple[Eigenvalue, ...]:
-    """The distinct eigenvalues with their Jordan blocks, the largest modulus first; NumPy, on concrete values.
+    """The distinct eigenvalues with their Jordan blocks, largest modulus first. It uses NumPy and needs concrete
+    values.
 
-    Rounding scatters an eigenvalue with a block of size k by a k-th root of itself, but not the mean of what it
-    becomes. Eigenvalues closer than `tolerance` count as one, their mean mu, and the ranks of (A - mu I)^j tell the
-    blocks; a singular value counts as zero below tolerance^2 times the largest possible.
+    Rounding splits an eigenvalue with a block of size k into several, at a distance of about the k-th root of rounding.
+    Their mean is accurate. So eigenvalues closer than `tolerance` count as one, with their mean mu as value. The ranks
+    of (A - mu I)^j give the sizes of the blocks. A singular value counts as zero if it is below tolerance^2 times the
+    largest possible one.
 
     Args:
         matrix: real, (n, n).
-        tolerance: relative to the largest entry of the scaled matrix, in (0, 1).
+        tolerance: in (0, 1); relative to the modulus of the eigenvalue, or to 1 if that is larger.
 
     Returns:
         A tuple of `Eigenvalue`.
 
     Raises:
-        TypeError, ValueError: no real square matrix; a tolerance that is not in (0, 1); eigenvalues within the
-            tolerance of each other that the ranks do not confirm as one.
+        TypeError, ValueError: not a real square matrix; a tolerance that is not in (0, 1); eigenvalues within the
+            tolerance of each other that are distinct according to the ranks.
 
     >>> A = [[2.0, 1.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]
     >>> [(round(x.value.real, 6), x.blocks) for x in jordan_structure(A)]
@@ -76,21 +78,21 @@ def _blocks(A: np.ndarray, members: list, tolerance: Real):
 
 
 def transient_growth(matrix: Real, num_steps: int, near: Real = None) -> np.ndarray:
-    """|D23| of Cardona, Geradin (1989), Fig. 1, from the powers of A, for n = 0 .. num_steps: (num_steps + 1,).
+    """The growth that a Jordan block of A causes over n = 0 .. num_steps steps: (num_steps + 1,).
 
-    What A^n does in the invariant subspace of an eigenvalue mu beyond multiplying by mu^n, relative to the first step:
-    |A^n - mu^n I|/|A - mu I| there. For Jordan blocks of size 2 this is n |mu|^(n-1), which peaks near n = -1/ln|mu|;
-    without a block it is zero.
+    It is |A^n - mu^n I|/|A - mu I| in the invariant subspace of an eigenvalue mu: the part of A^n beyond multiplication
+    by mu^n, relative to the first step. For Jordan blocks of size 2 this is n |mu|^(n-1), which peaks near
+    n = -1/ln|mu|. Without a block it is zero. This is |D23| of Cardona, Geradin (1989), Fig. 1.
 
     Args:
         matrix: A, real, (n, n). num_steps: the last n.
-        near: mu is the eigenvalue nearest to it, by default the largest.
+        near: mu is the eigenvalue nearest to this number; None: the eigenvalue of largest modulus.
 
     Returns:
         (num_steps + 1,).
 
     Raises:
-        TypeError, ValueError: as `jordan_structure`; a num_steps that is not a positive integer.
+        TypeError, ValueError: as `jordan_structure`; num_steps is not a positive integer.
 
     >>> import hhtjax
     >>> A = hhtjax.analysis.constraint_matrix(hhtjax.hht(alpha=-0.1, formulation="index3"))

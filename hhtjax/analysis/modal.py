@@ -1,4 +1,4 @@
-"""Normal modes of M w + K q = 0, and linear systems reduced to some of them."""
+"""Normal modes of M w + K q = 0, and the reduction of linear systems to their lowest modes."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ SHIFTS = 0.0, 1e-12, 1e-9, 1e-6  # relative to the largest K_ii/M_ii: the first 
 
 @shown
 class NormalModes(NamedTuple):
-    """What `modes` returns, of free vibration about rest.
+    """Result of `modes`: natural frequencies and mode shapes of free vibration about rest.
 
     Attributes:
         frequencies: (count,), rad per unit of time, lowest first, 0 for rigid motions.
-        shapes: T, (n, count), a mode in each column, with T^T M T = 1 and the largest entry of a column positive.
+        shapes: T, (n, count), with a mode in each column. T^T M T = 1, and the largest entry of a column is positive.
     """
 
     frequencies: np.ndarray
@@ -40,7 +40,7 @@ class NormalModes(NamedTuple):
 
 @shown
 class ModalReduction(NamedTuple):
-    """What `modal_reduction` returns: the reduced system, and the way to it and back.
+    """Result of `modal_reduction`: the reduced system, and the maps from and to the full coordinates.
 
     Attributes:
         system: the `LinearSystem` of the modal coordinates x, (count,).
@@ -55,11 +55,11 @@ class ModalReduction(NamedTuple):
     inverse: Array
 
     def expand(self, q: Array) -> Array:
-        """Coordinates (..., n) of modal ones (..., count), T q: positions, velocities, accelerations."""
+        """Full coordinates (..., n) from modal ones (..., count): T q, for positions, velocities or accelerations."""
         return jnp.asarray(q) @ jnp.asarray(self.shapes).T
 
     def project(self, q: np.ndarray) -> Array:
-        """Modal coordinates (..., count) of given ones (..., n), T^T M q: of what the modes span, exactly."""
+        """Modal coordinates (..., count) from full ones (..., n): T^T M q; exact for motions that the modes span."""
         return jnp.asarray(q) @ jnp.asarray(self.inverse).T
 
 
@@ -67,13 +67,14 @@ def modes(M: Real, K: Real, count: int | None = None) -> NormalModes:
     """The lowest modes of free vibration: K T = M T diag(frequencies^2).
 
     Args:
-        M, K: mass and stiffness, symmetric, M positive definite and K positive semidefinite: arrays (n, n), (n,) for
-            diagonals, or matrices of scipy.sparse of any size. With more than 1000 rows these are solved by Lanczos's
-            iteration on the shifted inverse (`scipy.sparse.linalg.eigsh`), the others by NumPy.
-        count: how many; None for all.
+        M, K: mass and stiffness, symmetric; M positive definite, K positive semidefinite. Arrays (n, n), or (n,) for
+            diagonals, or matrices of scipy.sparse of any size. Sparse matrices with more than 1000 rows, unless all
+            modes are asked for, are solved by Lanczos's iteration on the shifted inverse (`scipy.sparse.linalg.eigsh`),
+            all others by NumPy.
+        count: number of modes; None for all.
 
     Returns:
-        `NormalModes`, NumPy arrays.
+        `NormalModes`, with NumPy arrays.
 
     Raises:
         TypeError, ValueError: matrices of a wrong kind or shape, not symmetric, or indefinite; a count out of range.
@@ -104,24 +105,26 @@ def modes(M: Real, K: Real, count: int | None = None) -> NormalModes:
 
 
 def modal_reduction(system: LinearSystem, count, params: PyTree = None) -> ModalReduction:
-    """The linear system in its lowest `count` modes, q = T x:
+    """Reduces a linear system to its lowest `count` modes, q = T x:
 
         x'' + T^T C T x' + diag(frequencies^2) x = T^T f(t) + T^T g(T x, T v, t)
 
-    Modes that proportional damping leaves uncoupled stay so (a diagonal); other damping couples them. What f does to
-    the modes left out is missing, its static deflection too.
+    With proportional damping the modes stay uncoupled, and C becomes a diagonal. Other damping couples them. The
+    response of the modes left out is missing, including their static deflection.
 
     Args:
-        system: a `LinearSystem`, or (M, C, K), or (M, C, K, force), as it takes them, C may be None; matrices of
-            scipy.sparse may have any size. Matrices that are functions of params stay such, with T from the given
-            params: so parameters can be fitted through the reduced system. Its q and v are vectors x; a `nonlinear`
-            force without `at` gets vectors too, as do `friction` and `sliding`.
+        system: a `LinearSystem`, or (M, C, K), or (M, C, K, force), with arguments as for `LinearSystem`. C may be
+            None. Matrices of scipy.sparse may have any size. Matrices that are functions of params remain functions,
+            with a constant T from the given params. So parameters can be fitted through the reduced system. The q and v
+            of the reduced system are vectors. A `nonlinear` force without `at` gets vectors too, as do `friction` and
+            `sliding`.
         count: number of modes.
-        params: for functions of params.
+        params: params of the matrices that are functions.
 
     Returns:
-        A `ModalReduction`: its `system` for `simulate`, started from `project(q0)`, `project(v0)`; `expand(run.q)` are
-        the coordinates, and `suggest_step_size(reduced.system, stepper, ...)` says which modes a step resolves.
+        A `ModalReduction`. Pass its `system` to `simulate`, with `project(q0)` and `project(v0)` as start;
+        `expand(run.q)` gives the full coordinates. `suggest_step_size(reduced.system, stepper, ...)` shows which modes
+        a step resolves.
 
     Raises:
         TypeError, ValueError: as `modes`.
@@ -192,7 +195,7 @@ class _ProjectedLoad(Description):
 
 @dataclass(frozen=True, eq=False)
 class _Expanded(Description):
-    """f(T x, T v, t), a vector: of dry friction, whose numbers belong to joints."""
+    """f(T x, T v, t) as a vector: for dry friction, whose entries belong to joints and are not projected."""
 
     T: Any
     function: Callable
@@ -227,7 +230,7 @@ def _project(T: Real, A: Real) -> Real:
 
 
 def _uncoupled(T: np.ndarray, C) -> np.ndarray:
-    """T^T C T, or its diagonal, if all the rest is rounding."""
+    """T^T C T, or its diagonal if the other entries are only rounding."""
     C = C if is_sparse(C) else np.asarray(C)
     D = _project(T, C)
     d = np.diagonal(D)
@@ -237,12 +240,12 @@ def _uncoupled(T: np.ndarray, C) -> np.ndarray:
 
 
 def _eps(*matrices: Real) -> float:
-    """The coarsest of their roundings."""
+    """The largest machine epsilon of the matrices."""
     return max(float(np.finfo(np.result_type(getattr(A, "dtype", float), np.float32)).eps) for A in matrices)
 
 
 def _rows(name: str, A: Real) -> int:
-    """Number of rows of a matrix that is known, and square."""
+    """Number of rows of a matrix; raises an error unless it is known and square."""
     if not is_concrete(A):
         raise TypeError(f"modes: `{name}` must be known: call it outside jit, vmap and grad.")
     if not is_sparse(A):
@@ -258,7 +261,7 @@ def _require_symmetric(K, difference: Real):
 
 
 def _by_numpy(M, K: Real, count: int):
-    """Squares of the frequencies, shapes, and the size of the largest square, by Cholesky's factor of M."""
+    """(squares of the frequencies, shapes, size of the largest square), by the Cholesky factor of M."""
     M, K = (np.asarray(constant_matrix("modes", name, A)) for name, A in (("M", M), ("K", K)))
     require_mass("modes", "M", M)
     K = np.diag(K) if K.ndim == 1 else K
@@ -269,7 +272,7 @@ def _by_numpy(M, K: Real, count: int):
 
 
 def _by_lanczos(M, K, count, rounding):
-    """The same by SciPy, for sparse matrices; rounding: of squares, relative to the largest."""
+    """As `_by_numpy`, by SciPy for sparse matrices. rounding: of the squares, relative to the largest."""
     from scipy import sparse
     from scipy.sparse.linalg import ArpackError, eigsh
 

@@ -1,4 +1,4 @@
-"""Where a system is at rest: positions, multipliers and internal states of a static equilibrium."""
+"""Static equilibria: positions, multipliers and internal states with which a system is at rest."""
 
 from __future__ import annotations
 
@@ -24,14 +24,15 @@ BALANCED = 1e-8  # part of the forces that may be left of their sum; in float32 
 
 @shown
 class Equilibrium(NamedTuple):
-    """What `equilibrium` found.
+    """Result of `equilibrium`.
 
     Attributes:
-        q: positions, like q0; of a first-order system y.
+        q: positions, like q0; for a first-order system y.
         multipliers: L (m,), None without constraints.
-        z: internal states, like z0; None without.
-        left: the largest force, or violation of a constraint, that is left, over the largest there is.
-        converged: whether that is no more than rounding.
+        z: internal states, like z0; None without internal states.
+        left: the largest unbalanced force relative to the largest force; or, if that is larger, the largest
+            violation of a constraint relative to that at q0 (relative to 1 if that is less than 1).
+        converged: whether the residual is only rounding.
     """
 
     q: PyTree
@@ -48,19 +49,21 @@ def equilibrium(
 
         Q(q, 0, z, t0) + B^T L = 0,    Phi(q, t0) = 0,    g(q, 0, z, t0) = 0
 
-    with the force Q, the constraints Phi and the rates g of internal states. It is found by the method of Levenberg and
-    Marquardt, so that a start from which Newton's method would run away is good enough. There may be several, stable
-    ones and others: `hhtjax.analysis.modes` at it tells.
+    with the force Q, the constraints Phi and the rates g of internal states. It is found by the Levenberg-Marquardt
+    method, which also converges from starts from which Newton's method would diverge. A system may have several
+    equilibria, and the one found need not be stable. `hhtjax.analysis.suggest_step_size` at q lists the modes about it:
+    one with a negative damping ratio grows.
 
     Args:
         system: a `System`, `LinearSystem` or `FirstOrderSystem`, without dry friction and contact.
-        q0: where to look, like the q0 of `simulate`.
-        v0: of a system with rotations, for its structure: angular velocities (3,). Its values are not used.
+        q0: initial guess, like the q0 of `simulate`.
+        v0: needed for a system with rotations, to show which velocities are angular velocities (3,). Its values are not
+            used.
         params, t0, z0: as in `simulate`.
 
     Returns:
-        An `Equilibrium`, with derivatives in params, forward and reverse, where it is isolated. Under jit nothing
-        raises, and `converged` tells.
+        An `Equilibrium`. If it is isolated, it has forward and reverse derivatives by params. Under jit no error is
+        raised: check `converged`.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; no equilibrium was found.
@@ -76,7 +79,7 @@ def equilibrium(
     for name in ("friction", "contact"):
         if getattr(system, name, None) is not None:
             raise NotImplementedError(
-                f"equilibrium: `system` has {name}, with which bodies rest at many places. Simulate until it rests."
+                f"equilibrium: `system` has {name}, so its equilibria are not isolated. Simulate until it rests."
             )
     params = require_params("equilibrium", params)
     require_number("equilibrium", "t0", t0, np.isfinite, "be finite")
@@ -86,8 +89,8 @@ def equilibrium(
     found = _equilibrium(system, q0, v0, params, t0, z0)
     if all_concrete(found) and not found.converged:
         raise ValueError(
-            f"equilibrium: none was found near `q0`: {float(found.left):.3g} of the forces is left. Start nearer; what "
-            "moves freely, as a body without springs, has none."
+            f"equilibrium: none was found near `q0`: {float(found.left):.3g} of the forces is left. Start nearer. A "
+            "body that moves freely, without springs, has no equilibrium."
         )
     return found
 

@@ -1,4 +1,4 @@
-"""The step size that a system needs: its modes, and what a stepper makes of them."""
+"""The step size that a system needs, from its modes and from their error in a stepper, or from runs."""
 
 from __future__ import annotations
 
@@ -28,14 +28,16 @@ RIGID = 1e-7  # |lambda| relative to the largest that counts as zero
 
 
 class Mode(NamedTuple):
-    """A mode of the linearised system, and what the stepper makes of it at the suggested step.
+    """A mode of the linearised system, and its numerical solution with the suggested step.
 
     Attributes:
         frequency: |lambda|, natural frequency in rad/s, or rate of a motion that does not oscillate.
-        damping_ratio: -1 for pure growth, 1 for pure decay.
-        largest_dt: up to which the stepper keeps to the tolerance.
-        numerical_damping_ratio, period_elongation: of the discrete mode; NaN where one of the two does not oscillate.
-        resolved: whether the suggested step is below largest_dt.
+        damping_ratio: damping ratio of the mode; -1 for pure growth, 1 for pure decay.
+        largest_dt: largest step with which the stepper keeps the error of the mode within the tolerance, s.
+        numerical_damping_ratio: damping ratio of the mode in the steps.
+        period_elongation: relative error of its period in the steps. Both are NaN if the mode, or its numerical
+            solution, does not oscillate.
+        resolved: whether the suggested step is at most largest_dt.
     """
 
     frequency: float
@@ -47,12 +49,12 @@ class Mode(NamedTuple):
 
 
 class StepSize(NamedTuple):
-    """A suggestion; as text, a table.
+    """Result of `suggest_step_size`; prints as a table of the modes.
 
     Attributes:
-        dt: s.
-        reason: what limits it.
-        modes: a `Mode` for each, slowest first.
+        dt: suggested step size, s.
+        reason: what limits it, in words.
+        modes: a `Mode` for each mode, slowest first.
     """
 
     dt: float
@@ -92,45 +94,47 @@ def suggest_step_size(
     duration: Real = None,
     t0: Real = 0.0,
 ) -> StepSize:
-    """A step size that resolves the modes of the system linearised at a state, with what each mode then suffers.
+    """Suggests a step size that resolves the modes of the system, and lists the numerical error of each mode.
 
-    With a duration, one that brings the motion itself within the tolerance.
+    The modes are those of the system linearised at a state. With `duration` the suggestion comes from runs instead, and
+    keeps the error of the motion itself within the tolerance.
 
-    Small motions x about the state obey  M xddot + C xdot + K x = 0,  C = -Q_v,  K = (M w - Q - B^T L)_q,  and B x = 0
-    where there are constraints. Each solution exp(lambda t) becomes powers of an eigenvalue mu of the stepper's
-    oscillator, and counts as resolved where |log(mu)/(lambda h) - 1| <= tolerance: the errors of period and of
-    damping ratio together. (A real lambda is put into xddot = lambda xdot.) The step is the largest that resolves
+    Small motions x about the state obey  M xddot + C xdot + K x = 0,  C = -Q_v,  K = (M w - Q - B^T L)_q,  and with
+    constraints B x = 0. In the steps each solution exp(lambda t) becomes powers of an eigenvalue mu of the stepper's
+    oscillator. The mode is resolved if |log(mu)/(lambda h) - 1| <= tolerance, which combines the errors of the period
+    and of the damping ratio. (For a real lambda the test equation is xddot = lambda xdot.) The suggested step is the
+    largest one that resolves
 
-        highest = None    every mode that oscillates or grows, or where none does, of a LinearSystem, the slowest decay;
+        highest = None    every mode that oscillates or grows; if no mode of a LinearSystem does, the slowest decay;
         highest           every mode of |lambda| <= highest, in rad/s,
 
-    and for which no mode that decays grows in the steps, resolved or not. That is quick, and no more than a guide: it
-    knows neither how long the motion lasts, nor how large each mode is, nor what comes later. So where all modes of a
-    nonlinear system decay at the state (at rest within steep friction, say), there is no answer, but an error.
+    and for which no decaying mode grows in the steps, whether resolved or not. This is fast, but only a guide: it does
+    not consider how long the motion lasts, how large each mode is, or how the modes change later. If all modes of a
+    nonlinear system decay at the state (for example, at rest with steep friction), it raises an error.
 
-    With `duration`, runs with 8, 16, 32, ... steps are made until the RMS error of q, relative to its motion about its
-    mean, stays within the tolerance over [t0, t0 + duration], and the step is the largest that does. It costs about
-    eight times the run that it recommends, and at least 2000 steps. Runs that agree on what is wrong mislead it: a
-    method may damp a fast vibration out of all of them.
+    With `duration`, it makes runs with 8, 16, 32, ... steps, until the RMS error of q over [t0, t0 + duration] stays
+    within the tolerance. The error is relative to the RMS of q about its mean. The suggested step is the largest with
+    such an error. This takes about eight times as long as the suggested run, and at least 2000 steps. It is misled if
+    all runs have the same error, for example if the method damps a fast vibration out of all of them.
 
     Args:
-        system, stepper, q0, v0, params, z0, t0: as in `simulate`; no `FirstOrderSystem`. Modes change along the way, so
-            take the stiffest state of the motion. They are those of the frozen state: where it moves fast, they also
+        system, stepper, q0, v0, params, z0, t0: as in `simulate`; no `FirstOrderSystem`. Modes change along a motion,
+            so give its stiffest state. The modes are those of the frozen state. If the state changes fast, they also
             depend on the choice of coordinates.
         tolerance: in (0, 1).
-        highest: rad/s, of the modes that are to be resolved; None for all.
-        duration: s; without `highest`.
+        highest: largest frequency to be resolved, rad/s; None for all modes.
+        duration: duration of the runs, s; not together with `highest`.
 
     Returns:
         A `StepSize`, which prints as a table.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind or value; a system without a time scale of its own, or a
-            nonlinear one whose modes all decay (unless there is a duration); a tolerance out of reach; JAX in single
+        TypeError, ValueError: an argument of a wrong kind or value; a system without a time scale of its own; without
+            `duration`, a nonlinear system whose modes all decay; a tolerance that no step reaches; JAX in single
             precision.
-        NotImplementedError: constraints or rotations that the stepper does not know.
+        NotImplementedError: constraints or rotations that the stepper does not support.
 
-    Example: masses on a soft and on a stiff spring. The stiff one dictates, unless it is given up.
+    Example: masses on a soft and on a stiff spring. The stiff spring determines the step, unless `highest` excludes it.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> system = hhtjax.LinearSystem(M=jnp.ones(2), C=jnp.array([0.1, 0.0]), K=jnp.array([1.0, 1e4]))
@@ -190,8 +194,8 @@ def _modal_step(rates, resolved: np.ndarray, stable: np.ndarray, tolerance: Real
     moves = (rates.imag > 0) | (rates.real > 0)
     if highest is None and not linear and not moves.any():
         raise ValueError(
-            f"{caller}: no mode of the `system` oscillates or grows at q0, v0, and what decays there need not be what "
-            "limits the step of the motion: give a `duration`, take another state, or say up to which `highest`."
+            f"{caller}: no mode of the `system` oscillates or grows at q0, v0, and its decaying modes need not be what "
+            "limits the step of the motion: give a `duration`, a `highest`, or another state."
         )
     chosen = size <= highest if highest is not None else moves if moves.any() else size == size[0]
     if not chosen.any():
@@ -206,7 +210,7 @@ def _modal_step(rates, resolved: np.ndarray, stable: np.ndarray, tolerance: Real
 
 @jax.jit
 def linearized(system: System, q0: PyTree, v0: PyTree, params: PyTree, t0: Array, z0: PyTree):
-    """Derivatives of w in displacement and velocity, (N, N), and B, (m, N), internal states among the velocities."""
+    """Derivatives of w by displacement and velocity, (N, N), and B, (m, N). Velocities include internal states."""
     flat, q, v = flatten("suggest_step_size", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
 
@@ -219,7 +223,7 @@ def linearized(system: System, q0: PyTree, v0: PyTree, params: PyTree, t0: Array
 
 
 def rates_of(w_x: np.ndarray, w_v: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """lambda of the motions that satisfy B x = 0, one of each conjugate pair, slowest first; without rigid motions."""
+    """lambda of the motions with B x = 0, one of each conjugate pair, slowest first, without rigid motions."""
     N = np.linalg.svd(B)[2][len(B) :].T if len(B) else np.eye(len(w_x))
     zero = np.zeros((N.shape[1], N.shape[1]))
     A = np.block([[zero, np.eye(len(zero))], [N.T @ w_x @ N, N.T @ w_v @ N]])
@@ -242,7 +246,7 @@ def _errors(stepper: Stepper, direction: Real):
 
 
 def _reach(bad: np.ndarray) -> Real:
-    """The last of GRID before the first bad one; 0 if that is the first, inf if none is."""
+    """The last value of GRID before the first bad one; 0 if the first value is bad, inf if none is."""
     first = bad.argmax()
     return np.inf if not bad.any() else GRID[first - 1] if first else 0.0
 
@@ -268,9 +272,9 @@ def step_size_by_runs(
 ):
     """The largest step from which on the error of q stays within the tolerance, and the steps of the finest run.
 
-    The error is the RMS of q less that of the finest run, relative to the motion about its mean. Halving ends when two
-    runs in a row keep to the tolerance, since one could agree by chance, and not before a run of ENOUGH steps: a few
-    coarse ones agree where the method damps the same vibration out of all of them.
+    The error is the RMS difference of q from the finest run, relative to the RMS of q about its mean. Halving ends when
+    two runs in a row are within the tolerance, because a single one could agree by chance. It also goes on to a run of
+    at least ENOUGH steps, because coarse runs agree if the method damps the same vibration out of all of them.
 
     Raises:
         ValueError: more than MOST steps would be needed.
@@ -297,7 +301,7 @@ def step_size_by_runs(
 
 
 def _errors_of_runs(counts: list, paths: list, order: int) -> np.ndarray:
-    """Of all runs but the finest, which has an error of its own, by Richardson's extrapolation."""
+    """Errors of all runs but the finest. The error of the finest run is allowed for by Richardson's extrapolation."""
     finest = paths[-1]
     with np.errstate(over="ignore", invalid="ignore"):
         motion = motion_of(finest) if np.isfinite(finest).all() else np.nan
@@ -332,7 +336,7 @@ def _samples(
     duration: Array,
     num_steps: Array,
 ) -> Array:
-    """q at SAMPLES times, or, of fewer steps, after each; compiled once for all numbers of steps."""
+    """q at SAMPLES times, or after every step if there are fewer; compiled once for all numbers of steps."""
     dt = duration / num_steps
     between = jnp.maximum(1, num_steps // SAMPLES)
 

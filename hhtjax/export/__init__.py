@@ -1,9 +1,9 @@
-"""Out of Python: an identified model as C99, or as an FMU, for hard real time and for other programs.
+"""Export of a model as C99, or as an FMU, for hard real time and for other programs.
 
-A Python process keeps no deadline of a millisecond: now and then the operating system takes it away, and its own
-garbage collection too. So the step, parameters and all, can leave: `export_c` writes it as two files of C99 without
-dependencies, `export_fmu` as a functional mock-up unit (FMI 3.0, Co-Simulation) for Simulink, OpenModelica, Dymola and
-many more.
+A Python process cannot guarantee deadlines of a millisecond, because the operating system and the garbage collector
+interrupt it from time to time. So the step and its parameters can be exported. `export_c` writes two files of C99
+without dependencies. `export_fmu` writes a functional mock-up unit (FMI 3.0, Co-Simulation) for Simulink, OpenModelica,
+Dymola and others.
 
 >>> import jax.numpy as jnp, hhtjax
 >>> def force(q, v, t, params):
@@ -17,7 +17,7 @@ many more.
 >>> [field.name for field in model.params], [field.name for field in model.inputs]
 (['c', 'k'], ['torque'])
 
-`model.write(folder)` writes arm.c and arm.h. A control loop then is
+`model.write(folder)` writes arm.c and arm.h. A control loop with them:
 
     arm_state s;
     double q0[] = {1.0}, v0[] = {0.0}, torque[] = {0.0};
@@ -29,21 +29,21 @@ many more.
         use(s.q_arm[0], s.dq_arm_dk[0]);
     }
 
-What is written
----------------
+The C code
+----------
 
-The step is evaluated on numbers instead of arrays, each operation once, and printed, one constant for each. Branches
-("auto", Newton's iteration, `jnp.where` is none) stay branches, short loops with a fixed count are written out,
-eliminations of more than eight unknowns are a loop over a static array, and singular values, of
-`redundant="least_squares"`, are found by rotations. So C and `simulate` agree to rounding. The time of a step, and
-deadlines kept and missed, are measured on a page, `experiments/export/README.md`.
+The code is a list of operations on single numbers, each evaluated once and stored in a constant. Branches ("auto",
+Newton's iteration) stay branches; `jnp.where` is not a branch. Short loops with a fixed count are unrolled. Elimination
+with more than eight unknowns is a loop over an array. Singular values, for `redundant="least_squares"`, are computed by
+rotations. C and `simulate` agree to rounding. `experiments/export/README.md` has measured step times, and deadlines
+kept and missed.
 
-A step reads params and dt anew. What `simulate` does once, the factors of a `LinearSystem` of more than eight unknowns,
-the state keeps, until the params that they are made of, or dt, change: that step takes longer, and on the stack several
-times the size of the matrix. Large constant matrices are loops.
+Each call of the step reads params and dt. For a `LinearSystem` of more than eight unknowns, the factors of the matrix
+are kept in the state. They are computed again when dt, or a parameter of the matrix, changes. That step takes longer,
+and needs several times the size of the matrix on the stack. Large constant matrices are written as loops.
 
-Steps under error control, and events, are for `simulate` alone.
+Steps under error control, and events, cannot be exported.
 
-C compilers take long over very large functions: three rigid bodies on joints are 35000 operations, and half a minute.
-More than 100000 are refused.
+C compilers are slow on very large functions: three rigid bodies on joints are 35000 operations and take half a minute.
+More than 100000 operations raise an error.
 """

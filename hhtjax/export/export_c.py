@@ -1,4 +1,4 @@
-"""A system, a stepper and parameters as one file of C99, and its header."""
+"""Export of a system, a stepper and parameters as a C99 file with its header."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExportedC:
-    """A model in C; made by `export_c`.
+    """A model in C, made by `export_c`.
 
     Attributes:
-        name: of the files, and before every name in them.
+        name: name of the files, and prefix of every name in them.
         header, source: the text of name.h and name.c.
-        state, params, inputs: fields of the structs `name_state` and `name_params`, and the arrays that `u` holds one
-            after the other: (name, shape) of each.
-        values, input_values: of the params, one for each of their numbers, and of the inputs at the start.
-        units: {name of a field of these: its unit}, of those that were told.
-        operations, functions: how many operations on numbers a step has, and how many of them are sines, roots and the
-            like. Of a loop, its body counts once.
+        state, params, inputs: (name, shape) of the fields of the structs `name_state` and `name_params`, and of the
+            arrays that `u` holds one after the other.
+        values, input_values: values of all numbers of the params, and of the inputs at the start.
+        units: {name of a field: its unit}, for the fields whose unit was given.
+        operations, functions: number of operations of a step, and how many of them are functions such as sines and
+            roots. The body of a loop counts once.
     """
 
     name: str
@@ -64,7 +64,7 @@ class ExportedC:
     functions: int
 
     def write(self, folder) -> list[Path]:
-        """Writes name.c and name.h into a folder, which is made where it is not there; their paths."""
+        """Writes name.c and name.h into a folder, which is created if necessary. Returns their paths."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         paths = [folder / f"{self.name}.{kind}" for kind in "ch"]
@@ -77,46 +77,49 @@ def export_c(
     system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree = None, params: PyTree = None, *,
     z0: PyTree = None, name: str = "model", sensitivities: tuple = (), units: dict | None = None,
 ) -> ExportedC:  # fmt: skip
-    """The step of a system as C99 without dependencies: for hard real time, where Python cannot go.
+    """Exports the step of a system as C99 without dependencies, for hard real time.
 
         int NAME_init(NAME_state *s, const NAME_params *p, const NAME_real *q0, const NAME_real *v0,
                       NAME_real t0, NAME_real dt);
         int NAME_step(NAME_state *s, const NAME_params *p, const NAME_real *u, NAME_real dt);
 
-    The same operations as `stepper.step`, each on a number: C and `simulate` agree to rounding. Nothing is allocated,
-    nothing is global, all sizes are fixed; steps of several states may run at once. Both functions return flags, 0
-    where all is well, which the state keeps: NAME_NOT_FINITE, NAME_NOT_CONVERGED, NAME_DEPENDENT, NAME_NOT_SOLVED,
-    NAME_FRICTION. A non-iterative step has no loop, so that its worst case is its case, but for dry friction of several
-    joints, two rounds for each; Newton's iteration is bounded by its `max_iterations`.
+    The functions perform the same operations as `stepper.step`, on single numbers. So C and `simulate` agree to
+    rounding. They allocate no memory, have no global state, and all sizes are fixed. Steps of several states may run at
+    the same time. Both functions return flags, which the state keeps: 0 without problems, otherwise NAME_NOT_FINITE,
+    NAME_NOT_CONVERGED, NAME_DEPENDENT, NAME_NOT_SOLVED, NAME_FRICTION.
+
+    The time of a step is bounded. A non-iterative step has no loop. With dry friction it iterates at most two rounds
+    for each joint. Newton's iteration is bounded by its `max_iterations`.
 
     With dry friction the state has friction_sig, the directions in which joints slide (0 where they stick), and
     friction_tau, the forces.
 
     Args:
-        system: a `System`, `LinearSystem` or `FirstOrderSystem`. What is constant in it is written out.
+        system: a `System`, `LinearSystem` or `FirstOrderSystem`. Its constants are written into the code.
         stepper: `hht()`, `rk4()`, ...
-        q0, v0: position and velocity, whose keys name the fields of the state, and whose type, float64 or float32, is
+        q0, v0: position and velocity. Their keys name the fields of the state. Their type, float64 or float32, becomes
             `NAME_real`. `NAME_init` takes their numbers in the order of these fields, matrices row by row. A
-            `FirstOrderSystem` has y0 in the place of q0, no v0, and `NAME_init` no argument for it.
-        params: their floating numbers are the fields of `NAME_params`, these values `NAME_defaults`; keys of which C
-            makes one name are numbered, a_b and a_b_2. Integers and booleans are written out. Each `sampled` is an
-            input: `u` holds their values, one after the other, in the order of the leaves of params; a step holds them
-            from its start to its end, as one with `sampled(..., order=0)` does. `NAME_init` then takes the values
-            before the start, too.
-        z0: internal states, where the system has some; `NAME_init` then takes them behind v0.
-        name: of the files and before all names in C.
-        sensitivities: names of fields of `NAME_params` in which derivatives are stepped along: with "k", the state has
-            dq_dk, dv_dk, ... They are those of a run whose q0 and v0 do not depend on the params.
-        units: of fields, for comments in the header: {"q": "rad", "k": "N m/rad"}. A name tells for all fields of which
-            it is the first word, as "q" for q_arm, but for those that are named themselves.
+            `FirstOrderSystem` has y0 instead of q0 and no v0; `NAME_init` then has no argument v0.
+        params: their floating numbers are the fields of `NAME_params`; the values given here are `NAME_defaults`. If
+            two keys give the same name in C, the second is numbered: a_b and a_b_2. Integers and booleans are written
+            into the code. Each `sampled` is an input. `u` holds the values of all inputs, one after the other, in the
+            order of the leaves of params. They are constant during a step, as with `sampled(..., order=0)`. `NAME_init`
+            then also takes the values before the start.
+        z0: internal states, if the system has some. `NAME_init` then takes them after v0.
+        name: name of the files, and prefix of all names in C.
+        sensitivities: names of fields of `NAME_params` for which derivatives are computed in every step. With "k", the
+            state has dq_dk, dv_dk, ... They assume that q0 and v0 do not depend on the params.
+        units: units of fields, for comments in the header: {"q": "rad", "k": "N m/rad"}. A name also applies to all
+            fields that begin with it, as "q" for q_arm, unless they have an entry of their own.
 
     Returns:
         An `ExportedC`; its `write(folder)` writes both files.
 
     Raises:
-        NotImplementedError: an operation that cannot be written in C (a callback, sort, random numbers, eigenvalues):
-            with its name, and the line where it is used.
-        ValueError, TypeError: as `simulate`; a name that is none in C, sensitivities or units of no fields, tracers.
+        NotImplementedError: an operation that cannot be written in C (a callback, sort, random numbers, eigenvalues).
+            The message gives its name, and the line in which it is used.
+        ValueError, TypeError: as `simulate`; a name that C does not allow; sensitivities or units of fields that do not
+            exist; tracers.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, p: {"x": -p["k"] * q["x"]})
@@ -142,7 +145,7 @@ def exported(
     sensitivities: tuple,
     units: dict | None,
 ) -> ExportedC:
-    """`export_c`, under the name of its caller."""
+    """`export_c`, with error messages that begin with the name of the caller."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise ValueError(f"{caller}: `name` must be one that C allows, such as 'pendulum'; received {name!r}.")
     if name.lower() in files.TAKEN:
@@ -175,7 +178,7 @@ def exported(
 
 
 def _rows(caller: str, numbers: Numbers, sensitivities: tuple):
-    """(leaf, number in it) of each sensitivity, and the names of their numbers."""
+    """(leaf, index in it) of each number in which derivatives are taken, and the names of these numbers."""
     known = {field.name: i for i, field in enumerate(numbers.fields)}
     names = [sensitivities] if isinstance(sensitivities, str) else list(sensitivities)
     wrong = [name for name in names if name not in known]
@@ -208,14 +211,14 @@ class _Code:
         self.counts, self.factors = (0, 0), None
 
     def begin(self, f: Callable, args: tuple) -> Body:
-        """Of NAME_init."""
+        """The body of NAME_init."""
         starts = [f"{key}[{i}]" for key, x in sorted(self.made.starts.items()) for i in range(_count(x))]
         if self.rows:
             f, args = with_derivatives(f, self.rows), ([], *args)
         return self._text(f, args, [*starts, *self._values(), *self._inputs("u"), "t0", "dt"])
 
     def step(self, f: Callable, args: tuple) -> Body:
-        """Of NAME_step."""
+        """The body of NAME_step."""
         state = ["s->t"]
         for leaf, floats in list(zip(self.layout.places("s->"), self.floating, strict=True))[1:]:
             state += leaf if floats else [f"(int32_t){place}" for place in leaf]
@@ -237,8 +240,10 @@ class _Code:
         return [place for rows in self.derivatives for row in rows for field in row for place in field.places("s->")]
 
     def _text(self, f: Callable, args: tuple, names: list, kept: bool = False) -> Body:
-        """Statements that read arguments, compute, and write the state and the flags. kept: what follows from params
-        and dt alone, at some cost, is in the state."""
+        """Statements that read the arguments, compute, and write the state and the flags.
+
+        kept: whether expensive results that depend only on params and dt are kept in the state.
+        """
 
         def numbers_of(*args: PyTree):
             state, *change, flags = f(*args)
@@ -262,7 +267,7 @@ class _Code:
         return files.Body(text.lines, text.text(flags.item()), reads, text.helpers)
 
     def _begun(self, listing, places: dict):
-        """All operations, behind constants for what they read; and the places of that."""
+        """Constants for all values that are read, followed by all operations; and the places that are read."""
         text = Statements({}, self.name, (np.dtype(self.made.dtype), f"{self.name}_real"))
         found = {scalar: place for scalar, place in places.items() if scalar in files.used(listing)}
         for scalar, place in found.items():
@@ -273,7 +278,7 @@ class _Code:
         return text, set(found.values())
 
     def _factors(self, factors: list, operations: list, places: dict):
-        """What makes them, or None without."""
+        """The statements that compute the kept factors; None without factors."""
         if not factors:
             return None
         text, reads = self._begun(Listing([*places], operations, [np.array(factors, object)]), places)

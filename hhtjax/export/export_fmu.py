@@ -1,4 +1,4 @@
-"""A system, a stepper and parameters as a functional mock-up unit: FMI 3.0, Co-Simulation."""
+"""Export of a system, a stepper and parameters as a functional mock-up unit: FMI 3.0, Co-Simulation."""
 
 import hashlib
 import platform
@@ -61,12 +61,12 @@ BUILD = """<?xml version="1.0" encoding="UTF-8"?>
 
 @dataclass(frozen=True)
 class ExportedFMU:
-    """A functional mock-up unit; made by `export_fmu`.
+    """A functional mock-up unit, made by `export_fmu`.
 
     Attributes:
         c: the model in C, an `ExportedC`.
         description: the text of modelDescription.xml.
-        wrapper: the text of sources/fmi3.c, which has the functions of FMI.
+        wrapper: the text of sources/fmi3.c, which contains the functions of FMI.
     """
 
     c: ExportedC
@@ -74,9 +74,9 @@ class ExportedFMU:
     wrapper: str = entry(repr=False)
 
     def write(self, folder) -> Path:
-        """Writes name.fmu into a folder, with sources, and a binary of this platform; its path.
+        """Writes name.fmu into a folder, with sources and a binary for this platform. Returns its path.
 
-        Without a C compiler (cc, gcc or clang) it warns, and the unit has sources alone.
+        Without a C compiler (cc, gcc or clang) it warns, and the unit contains only the sources.
         """
         folder, name = Path(folder), self.c.name
         folder.mkdir(parents=True, exist_ok=True)
@@ -89,7 +89,7 @@ class ExportedFMU:
         system = platform.system().lower()
         binary = _binary(name, {path: str(text) for path, text in files.items()})
         if binary is None:
-            warnings.warn(f"export_fmu: no C compiler here, so {name}.fmu has no binary, but sources.", stacklevel=2)
+            warnings.warn(f"export_fmu: no C compiler found: {name}.fmu contains sources, but no binary.", stacklevel=2)
         else:
             ending = {"darwin": "dylib", "windows": "dll"}.get(system, "so")
             machine = {"AMD64": "x86_64", "arm64": "aarch64"}.get(platform.machine(), platform.machine())
@@ -102,7 +102,7 @@ class ExportedFMU:
 
 
 def _binary(name, files):
-    """The shared library of the sources, or None without a compiler."""
+    """The shared library compiled from the sources; None without a compiler."""
     compiler = next((x for x in ("cc", "gcc", "clang") if shutil.which(x)), None)
     if compiler is None:
         return None
@@ -118,13 +118,20 @@ def export_fmu(
     system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree = None, params: PyTree = None, *,
     z0: PyTree = None, dt: Real, name: str = "model", sensitivities: tuple = (), units: dict | None = None,
 ) -> ExportedFMU:  # fmt: skip
-    """A system as a functional mock-up unit (FMI 3.0, Co-Simulation), for Simulink, OpenModelica, Dymola and others.
+    """Exports a system as a functional mock-up unit (FMI 3.0, Co-Simulation), for Simulink, OpenModelica, Dymola, ...
 
-    Its outputs are the fields of the state of `export_c` (q, v, w, ..., and derivatives), its tunable parameters the
-    floating numbers of params, its fixed parameters the initial values (q0, v0, z0), and its inputs each `sampled` of
-    params, held over a step. A communication step is as many steps of dt as fit into it, or, where it is no multiple,
-    steps a little shorter. A name that another variable has already gets a number: beside the outputs a, a parameter a
-    is a_2. A flag of the step is fmi3Error, from which `fmi3Reset` or an earlier state leads back.
+    Variables of the unit:
+
+        outputs               the fields of the state of `export_c` (q, v, w, ..., and derivatives)
+        tunable parameters    the floating numbers of params
+        fixed parameters      the initial values (q0, v0, z0)
+        inputs                each `sampled` of params, constant during a step
+
+    If a name is already used by another variable, a number is added: if the outputs include a, a parameter a becomes
+    a_2.
+
+    A communication step is divided into steps of dt. If it is not a multiple of dt, the steps are a little shorter. If
+    a step sets a flag, the unit returns fmi3Error. To go on, call `fmi3Reset` or restore an earlier state.
 
     Args:
         system, stepper, q0, v0, params, z0, name, sensitivities, units: as in `export_c`.
@@ -134,7 +141,7 @@ def export_fmu(
         An `ExportedFMU`; its `write(folder)` writes name.fmu.
 
     Raises:
-        NotImplementedError, ValueError, TypeError: as `export_c`; a dt that is not positive.
+        NotImplementedError, ValueError, TypeError: as `export_c`; dt is not positive.
 
     References:
         Modelica Association, Functional Mock-up Interface Specification 3.0 (2022).
@@ -188,25 +195,27 @@ def export_fmu(
 
 
 def _unit_definitions(units):
-    """Of all units that variables have."""
+    """The XML definitions of all units that occur."""
     names = "".join(f"\n    <Unit name={quoteattr(text)}/>" for text in sorted(set(units.values())))
     return f"\n  <UnitDefinitions>{names}\n  </UnitDefinitions>" if names else ""
 
 
 def _of_xml(x):
-    """A number as XML Schema has it."""
+    """A number as text in XML Schema."""
     return {"inf": "INF", "-inf": "-INF", "nan": "NaN"}.get(repr(x), repr(x))
 
 
 def _named(*groups):
-    """Pairs of each field and one with the name of its variable: of all groups no two are alike, and none is "time"."""
+    """Pairs of each field and one with the name of its variable. All names are different, and none is "time"."""
     names = iter(distinct([*chain(*groups)], taken=["time"]))
     return [[(field, next(names)) for field in group] for group in groups]
 
 
 def _variables(kind, found, struct, attributes, values, units, array=None):
-    """(element of the description, place in C) of each number. found: of `_named`. array: that holds them all, in the
-    place of a struct."""
+    """(element of the description, place in C) of each number.
+
+    found: from `_named`. array: name of an array that holds the numbers, instead of a struct.
+    """
     rows = []
     for field, named in found:
         for i, place in enumerate(field.places(struct or "")):
@@ -221,7 +230,7 @@ def _variables(kind, found, struct, attributes, values, units, array=None):
 
 
 def _arguments(starts, c):
-    """Of NAME_init, between params and t0."""
+    """The arguments of NAME_init between params and t0."""
     first, words = 0, []
     for _, tree in starts:
         words.append(f"m->start + {first}, ")

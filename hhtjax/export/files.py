@@ -1,4 +1,4 @@
-"""The text of the two files."""
+"""The text of the two C files, from the statements of the functions."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ static void {name}_factorize({name}_state *s, const {name}_params *p, const {nam
 
 
 class Factors(NamedTuple):
-    """Statements that make the arrays `name_state.factors_i`, the places that they read, types and sizes of these."""
+    """Statements that compute the arrays `name_state.factors_i`, the places that they read, their types and sizes."""
 
     lines: list[str]
     reads: list[str]
@@ -125,7 +125,7 @@ class Factors(NamedTuple):
 
 
 class Body(NamedTuple):
-    """Statements, the name of their flags, the places that they read, the helper functions that they call."""
+    """Statements, the name of the flags, the places that are read, and the helper functions that are called."""
 
     lines: list[str]
     flags: str
@@ -134,7 +134,7 @@ class Body(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """What the files are made of."""
+    """The parts of which the files are composed."""
 
     name: str
     made: Given
@@ -149,7 +149,7 @@ class Parts(NamedTuple):
 
 
 def used(listing: Listing):
-    """The scalars that its operations and results read."""
+    """The scalars that the operations and results of a listing read."""
     found = {x for value in _arrays(listing.results) for x in value.flat if isinstance(x, Scalar)}
     pending = list(listing.operations)
     while pending:
@@ -166,7 +166,7 @@ def _arrays(tree: PyTree):
 
 
 def local(place: str, name: str) -> str:
-    """The name of a constant for a member of a struct or an element of an array, unlike those of a model `name`.
+    """The name of a local constant for a struct member or array element, different from all names of model `name`.
 
     >>> [local(place, "p") for place in ("p->k", "s->q[3]", "p->k[3]", "u[0]", "(int32_t)s->sign", "dt")]
     ['p_k_', 's3_q', 'p3_k', 'u_0', 's_sign', 'dt']
@@ -177,10 +177,10 @@ def local(place: str, name: str) -> str:
 
 
 def header(parts: Parts) -> str:
-    """Of name.h."""
+    """The text of name.h."""
     name, real = parts.name, f"{parts.name}_real"
     operations, functions = parts.counts
-    again = " Beyond them, factors are made anew where dt or params differ from the step before." * bool(parts.factors)
+    again = " If dt or params have changed since the step before, factors are computed again." * bool(parts.factors)
     num_inputs = sum(field.size for field in parts.numbers.inputs)
     rest = [Field("u", (num_inputs,)).declaration(real)] if num_inputs else []
     rest += [Field("t0", ()).declaration(real), Field("dt", ()).declaration(real), "    int64_t steps;"]
@@ -207,7 +207,7 @@ def _input(field: Field, unit) -> str:
 
 
 def source(parts: Parts) -> str:
-    """Of name.c."""
+    """The text of name.c."""
     begin, body = parts.texts
     num_inputs = sum(field.size for field in parts.numbers.inputs)
     keep = f"    memcpy(s->u, u, {num_inputs} * sizeof *u);\n" if num_inputs else ""
@@ -227,7 +227,7 @@ def source(parts: Parts) -> str:
 
 
 def _factorize(parts: Parts):
-    """The function, and whether it is to be called again."""
+    """The function that computes the factors, and the C condition under which it is called again."""
     factors, name = parts.factors, parts.name
     if factors is None:
         return "", ""
@@ -249,13 +249,13 @@ def _signatures(parts: Parts, restrict: str):
 
 
 def _unused(text: Body, arguments: list) -> str:
-    """Statements that keep compilers quiet."""
+    """Statements that avoid compiler warnings about unused arguments."""
     read = {re.split(r"\W", place)[0] for place in text.reads}
     return "".join(f"    (void){name};\n" for name in arguments if name not in read)
 
 
 def _values(parts: Parts) -> str:
-    """Of the params."""
+    """The values of the params as text in C."""
     lines = []
     for field, value in zip(parts.numbers.fields, parts.numbers.values, strict=True):
         numbers = [number(x) for x in np.ravel(np.asarray(value, parts.made.dtype))]

@@ -1,4 +1,4 @@
-"""A system and a stepper as two functions of flat lists of numbers: to begin, and to step; with derivatives or not."""
+"""A system and a stepper as two functions of flat lists of numbers, begin and step, with or without derivatives."""
 
 from __future__ import annotations
 
@@ -63,15 +63,15 @@ class Field(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many numbers it holds."""
+        """Number of entries."""
         return int(np.prod(self.shape, dtype=int))
 
     def places(self, struct: str):
-        """C for each of them, given that of the struct with its dot or arrow."""
+        """The C expression of each number. struct: the C expression of the struct, with its dot or arrow."""
         return [f"{struct}{self.name}" if self.shape == () else f"{struct}{self.name}[{i}]" for i in range(self.size)]
 
     def declaration(self, real: str, unit=None) -> str:
-        """In the struct, with its unit, and its shape where it has more than one axis."""
+        """Its declaration in the struct, with unit, and with shape if it has more than one axis."""
         size = f"[{self.size}]" if self.shape else ""
         shape = f"{' x '.join(map(str, self.shape))}, row by row" if len(self.shape) > 1 else None
         told = "; ".join(filter(None, (shape, unit)))
@@ -79,7 +79,7 @@ class Field(NamedTuple):
 
 
 def fields(tree: PyTree, prefix: str, alone: str):
-    """A field for each leaf of a pytree. alone: the name of one that has no path."""
+    """A field for each leaf of a pytree. alone: name of the field if the pytree is a single leaf."""
     return [
         Field(identifier([prefix, *map(_word, path)]) if path or prefix else alone, np.shape(leaf))
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
@@ -94,7 +94,7 @@ def identifier(words: list) -> str:
 
 
 def units_of(caller: str, units: dict | None, found: list):
-    """{name of a field: its unit}, from those of fields, or of all whose names begin with such a word."""
+    """{name of a field: its unit}. An entry of `units` also applies to all fields whose names begin with it."""
     units = {} if units is None else units
     if not isinstance(units, dict) or not all(isinstance(x, str) for pair in units.items() for x in pair):
         raise TypeError(f"{caller}: `units` must be a dict of names and texts, as {{'q': 'rad'}}; received {units!r}.")
@@ -114,7 +114,7 @@ def units_of(caller: str, units: dict | None, found: list):
 
 
 def distinct(found: list, taken: Sequence = ()):
-    """The fields, each with a name of its own: one that an earlier field has, or that is taken, gets a number."""
+    """The fields with different names: a number is added to a name that is taken, or that an earlier field has."""
     own, given, result = {field.name for field in found}, set(taken), []
     for field in found:
         numbered = (f"{field.name}_{i}" for i in itertools.count(2))
@@ -131,16 +131,16 @@ def _word(key) -> str:
 # ----------------------------------------------------------------------------
 
 FLAGS = {  # what failed, in bits
-    "NOT_FINITE": "a number of the state is infinite or none",
+    "NOT_FINITE": "a number of the state is infinite or NaN",
     "NOT_CONVERGED": "Newton's iteration did not converge",
     "DEPENDENT": "a constraint depends on those before it",
     "NOT_SOLVED": "the linear solve left more than its tolerance",
-    "FRICTION": "a limit of the dry friction is negative or no number, or joints switch too often in a step",
+    "FRICTION": "a limit of the dry friction is negative or NaN, or joints switch too often in a step",
 }
 
 
 class Given(NamedTuple):
-    """What was given, checked. starts: {name in C: tree} of q0, v0, z0, without those that the system has not."""
+    """The checked arguments of an export. starts: {name in C: tree} of those of q0, v0, z0 that the system has."""
 
     caller: str
     system: Any
@@ -158,7 +158,7 @@ class Given(NamedTuple):
 def given(
     caller: str, system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree, params: PyTree, z0: PyTree
 ) -> Given:
-    """The arguments of an export, checked."""
+    """Checks the arguments of an export."""
     require_system(caller, system)
     require_stepper(caller, stepper)
     q0, v0, z0 = initial_values(caller, system, q0, v0, z0)
@@ -166,19 +166,21 @@ def given(
     params = require_params(caller, params)
     require_dense(caller, system, params)
     if system.contact is not None:
-        raise NotImplementedError(f"{caller}: `system` has contact, which is not written out: leave `contact` out.")
+        raise NotImplementedError(f"{caller}: `system` has contact, which cannot be exported: leave `contact` out.")
     if system.friction is not None:
         system = with_known_rows(caller, system, q0, v0, 0.0, params, z0)
     if not all_concrete((system, stepper, q0, v0, params, z0)):
-        raise TypeError(f"{caller}: all arguments must be numbers, because they are written out; received tracers.")
+        raise TypeError(
+            f"{caller}: all arguments must be known numbers, to be written into the code; received tracers."
+        )
     starts = {name: x for name, x in (("q0", q0), ("v0", v0), ("z0", z0)) if x is not None}
     return Given(caller, system, stepper, starts, params, jax.tree.leaves(q0)[0].dtype)
 
 
 class Numbers:
-    """The params as what may change in C: `fields` of floating numbers with their `values`, and `inputs`.
+    """The params that may change in C: `fields` of floating numbers with their `values`, and `inputs`.
 
-    Every `sampled` is an input, held over each step. Integers and booleans stay what they are.
+    Every `sampled` is an input, constant during each step. Integers and booleans are constants.
     """
 
     def __init__(self, params: PyTree, dtype: np.dtype):
@@ -197,13 +199,13 @@ class Numbers:
         return self.structure.unflatten([changes.get(i, x) for i, x in enumerate(self.leaves)])
 
     def params(self, values: list, u: list):
-        """The params with other numbers, and inputs of the values u, one array for each."""
+        """The params with other numbers, and with inputs that have the values u, one array for each input."""
         constant = [self.leaves[i].constant(x) for i, x in zip(self.input_places, u, strict=True)]
         changes = dict(zip([*self.places, *self.input_places], [*values, *constant], strict=True))
         return thaw(self._with(changes))
 
     def first_inputs(self):
-        """Their values at the first of their samples."""
+        """The values of the inputs at their first samples."""
         return [self.leaves[i].polynomials[0, 0] for i in self.input_places]
 
 
@@ -216,7 +218,7 @@ def _is_floating(x):
 
 
 def begin(made: Given, numbers: Numbers):
-    """The function (starts, values, u, t0, dt) -> (state on vectors, flags); the time of the state is for others."""
+    """The function (starts, values, u, t0, dt) -> (state on vectors, flags). The time in the state is set elsewhere."""
 
     def f(starts: dict, values: list, u: list, t0: Array, dt: Array):
         params = numbers.params(values, u)
@@ -243,7 +245,7 @@ def step(made: Given, numbers: Numbers):
 
 
 def _kept(stepper: Stepper, state: State) -> State:
-    """The state without what only dense output reads, which C has not."""
+    """The state without memory that only dense output reads, because C has no dense output."""
     return state._replace(memory=None) if stepper.dense_term or stepper.reads_series else state
 
 
@@ -265,10 +267,11 @@ def _floats(tree: PyTree):
 
 
 def with_derivatives(f: Callable, rows: list):
-    """The same function with derivatives in the numbers of the params that `rows` names: (leaf, number in it).
+    """The function f with derivatives by some numbers of the params. rows: (leaf, index in it) of each number.
 
-    A first argument before the others: for each floating leaf of a state that is the first of the others, but its time,
-    the derivatives (rows, ...); else none. Results: state, derivatives, flags.
+    It has an additional first argument. If f takes a state as its first argument, this is a list of the derivatives
+    (rows, ...) of each floating leaf of the state except its time; otherwise it is an empty list. Results: state,
+    derivatives, flags.
     """
 
     def g(tangents: list, first: PyTree, values: list, *rest: PyTree):
@@ -293,7 +296,7 @@ def with_derivatives(f: Callable, rows: list):
 
 
 def _units(value: Array, places: list) -> Array:
-    """For each place the unit vector in the shape of a value, or zeros."""
+    """For each place the unit vector, in the shape of `value`; zeros if the place is None."""
     found = np.zeros((len(places), np.size(value)), jnp.result_type(value))
     for row, place in zip(found, places, strict=True):
         row[[] if place is None else [place]] = 1
@@ -306,14 +309,14 @@ def _replaced(tree: PyTree, floats) -> State:
 
 
 class Layout(NamedTuple):
-    """The fields of a state in C, and for each of its leaves, in their order, the fields that hold it."""
+    """The fields of a state in C, and for each leaf of the state the fields that hold it."""
 
     fields: list
     leaves: list
 
     @classmethod
     def of(cls, made: Given, state: State) -> Layout:
-        """state: on vectors, or its shapes."""
+        """The layout of a state. state: on vectors, or its shapes."""
         first_order = isinstance(made.system, FirstOrderSystem)
         trees = dict(made.starts)
         q, v, z = trees.get("q0"), trees.get("v0"), trees.get("z0")
@@ -334,10 +337,10 @@ class Layout(NamedTuple):
         return cls(found, [[next(own) for _ in leaf] for leaf in leaves])
 
     def places(self, struct: str):
-        """C for every number of the state, leaf by leaf."""
+        """The C expression of every number of the state, leaf by leaf."""
         return [[place for field in leaf for place in field.places(struct)] for leaf in self.leaves]
 
 
 def derivative_field(field: Field, name: str) -> Field:
-    """Of the derivative of a field with respect to a number of the params."""
+    """The field of the derivative of a field by a number of the params."""
     return Field(f"d{field.name}_d{name}", field.shape)

@@ -24,7 +24,7 @@ class Statements:
         self.helpers, self.lines, self.depth = set(), [], 1
 
     def write(self, operations: list):
-        """All of them, at the end of `lines`."""
+        """Adds all operations to `lines`."""
         for x in operations:
             getattr(self, f"_{x.name}", self._plain)(x)
 
@@ -33,11 +33,11 @@ class Statements:
         return self.names[operand] if isinstance(operand, Scalar) else number(operand)
 
     def type(self, dtype: np.dtype):
-        """Of C."""
+        """The C name of a type."""
         return self.real[1] if dtype == self.real[0] else TYPES[np.dtype(dtype)]
 
     def line(self, text: str):
-        """One more."""
+        """Adds a line."""
         self.lines.append("    " * self.depth + text)
 
     def _name(self, scalar) -> str:
@@ -133,7 +133,7 @@ class Statements:
         self.line(f"{function}({params['n']}, {self.text(A)}, {self.text(found)}, {flags});")
 
     def _copy(self, source, target):
-        """An array that is to be written over."""
+        """Declares an array as a copy of `source`, to be overwritten."""
         name = self._name(target)
         self.line(f"{self.type(target.dtype)} {name}[{target.size}];")
         self.line(f"memcpy({name}, {self.text(source)}, sizeof {name});")
@@ -166,7 +166,7 @@ class Statements:
         self.line("}")
 
     def _inside(self, block, targets: list):
-        """A block, whose results are then given to variables; first read, if they are such variables themselves."""
+        """A block and the assignment of its results to variables. Results that are such variables are copied first."""
         self.depth += 1
         self.write(block.operations)
         pairs = [(target, y) for target, y in zip(targets, block.results, strict=True) if target is not y]
@@ -183,7 +183,7 @@ class Statements:
 
 
 class NotWritten(Exception):
-    """An operation, or a type, that has no text."""
+    """An operation, or a type, that cannot be written in C."""
 
 
 # ----------------------------------------------------------------------------
@@ -303,7 +303,7 @@ HELPERS = {
 {
     return isnan(a) ? 0 : (a < low ? low : (a > high ? high : a));
 }""",
-    "lu": """/* L below the diagonal and U on and above it: row i of a, its rows in the given order, is that of L U */
+    "lu": """/* replaces a by L (below the diagonal) and U: L U is a with its rows in the returned order */
 static void #_lu(const int n, @ *const a, int32_t *const pivots, int32_t *const order)
 {
     int i, j, k;
@@ -337,7 +337,7 @@ static void #_lu(const int n, @ *const a, int32_t *const pivots, int32_t *const 
         }
     }
 }""",
-    "triangular": """/* the x of a triangle of a, or of its transpose, in the place of its right-hand side */
+    "triangular": """/* solves with a triangle of a, or with its transpose; x: the right-hand side, then the result */
 static void #_triangular(const int n, const @ *const a, @ *const x, const int lower, const int transpose,
                          const int unit)
 {
@@ -353,8 +353,8 @@ static void #_triangular(const int n, const @ *const a, @ *const x, const int lo
         }
     }
 }""",
-    "svd": """/* s, u and the transpose of v with a = u diag(s) v^T, s falling: by rotations of columns in pairs until
-   they are orthogonal (Hestenes 1958), or nothing but rounding; what is not after so many sweeps is no number */
+    "svd": """/* s, u and the transpose of v with a = u diag(s) v^T and decreasing s: rotates columns in pairs until
+   they are orthogonal, or only rounding (Hestenes 1958); NaN if this takes too many sweeps */
 static void #_svd(const int n, const @ *const a, @ *const s, @ *const u, @ *const vt)
 {
     int i, j, k, sweep, turned = 1;

@@ -1,8 +1,8 @@
-"""Parameters from measurements, and how far to trust them; the everyday names are those of `hhtjax` too.
+"""Parameters from measurements, and how far to trust them. The everyday names are also in `hhtjax`.
 
-A fit makes a sum of squares least: `fit` takes a function of the unknown parameters that returns residuals, simulated
-less measured, and finds the parameters by Levenberg-Marquardt, with exact derivatives through every step of the run.
-Stiffness and damping of a pendulum from what was measured, with standard errors:
+You write a function of the unknown parameters that returns residuals, simulated minus measured. `fit` finds the
+parameters that minimise their sum of squares. It uses Levenberg-Marquardt with exact derivatives through every step of
+the simulation. Example: stiffness and damping of a pendulum from a measured angle, with standard errors:
 
 >>> import jax, jax.numpy as jnp, hhtjax
 >>> def force(q, v, t, params):
@@ -18,22 +18,24 @@ Stiffness and damping of a pendulum from what was measured, with standard errors
 >>> bool(result.converged), bool(abs(result.params["k"] - 2.0) < 5 * result.standard_errors["k"])
 (True, True)
 
-`print(result.summary())` shows estimates with intervals, and names what the data cannot tell apart.
+`print(result.summary())` shows the estimates with confidence intervals. It also names the parameters that the data do
+not determine.
 
-Errors one can trust
---------------------
+Standard errors
+---------------
 
-Textbook standard errors take every residual for independent noise. Residuals of a real fit are correlated, because the
-model is never quite right, and such errors are then several times too small. Here the record is cut into segments that
-are long against that correlation, and the error comes from how much the segments disagree about the parameters. (In the
-literature: a cluster-robust, or "cluster sandwich", covariance.) `result.summary()` shows how many times larger it is
-than the textbook's.
+Textbook standard errors assume that every residual is independent noise. The residuals of a real fit are correlated,
+because the model is never quite right. Textbook errors are then several times too small. `fit` therefore cuts the
+record into segments that are long compared with the correlation time. The standard error comes from the scatter between
+the segments. (In the literature: a cluster-robust, or "cluster sandwich", covariance.) `result.summary()` shows the
+ratio of this error to the textbook's.
 
-What an estimate depends on
----------------------------
+Derivatives of estimates
+------------------------
 
-Estimates have derivatives in what a fit is given: in samples, weights, priors, and in all that the residuals read. By
-how much the stiffness changes with the mass, which was taken for known (the motion tells k/m):
+Estimates are differentiable with respect to the inputs of a fit: samples, weights, priors, and all values that the
+residuals read. Example: how the stiffness changes with the mass, which was assumed to be known. (The motion determines
+only k/m.)
 
 >>> def stiffness(m):
 ...     known = lambda unknown: simulated(unknown | {"m": m}) - measured
@@ -41,57 +43,64 @@ how much the stiffness changes with the mass, which was taken for known (the mot
 >>> round(float(jax.jacfwd(stiffness)(1.0)), 2)                              # k/m; by jax.grad too
 2.0
 
-What a fit can be told
-----------------------
+Options of a fit
+----------------
 
 ==============  ==================================================================================================
-option          what it says
+option          meaning
 ==============  ==================================================================================================
-`transforms=`   `positive`, `bounded(lower, upper)`, `fixed`: kept positive, inside bounds, or as it is
-`weights=`      one over the deviation of the noise; 0 marks missing samples
+`transforms=`   `positive`, `bounded(lower, upper)`, `fixed`: keep a parameter positive, inside bounds, or unchanged
+`weights=`      one over the standard deviation of the noise; 0 marks missing samples
 `loss=`         robust against outliers: `"huber"`, `"soft_l1"`, `"cauchy"`
-`prior=`        `Gaussian(mean, deviation)`: what was known before
-`records=`      many records, or `windows` of one, each with initial values of its own (`starts=`), which are fitted and
-                eliminated: each step of the fit is solved as if only the parameters were unknown
+`prior=`        `Gaussian(mean, deviation)`: prior knowledge of a parameter
+`records=`      many records, or `windows` of one record. Each has its own initial values (`starts=`), which are fitted
+                too. They are eliminated, so that a step costs as much as if only the parameters were unknown
 ==============  ==================================================================================================
 
-How the minimum is found
-------------------------
+The algorithm
+-------------
 
-Levenberg-Marquardt solves a linear least-squares problem for each step, and damps it. Where a step lowers the cost as
-predicted, the damping falls, faster with each such step in a row; where it does not, the next step is at most half as
-long. Each run brings its exact Jacobian, and two Jacobians tell how the residuals bend along the last step. A further
-step is corrected for that (geodesic acceleration), so that it follows a curved valley; this costs no run.
+Each step of Levenberg-Marquardt solves a damped linear least-squares problem. When a step lowers the cost as predicted,
+the damping falls; it falls faster with each further such step. When a step does not lower the cost, the next step is at
+most half as long. Each simulation also returns its exact Jacobian. Two Jacobians give the curvature of the residuals
+along the last step. The next step is corrected for this curvature (geodesic acceleration), so that it follows a curved
+valley. The correction needs no further simulation.
 
-A fit ends where the gradient vanishes. It also ends where the last step changed the cost, or the unknowns, by less than
-`tolerance`; then the gradient or the residual must be small too, and so the damping or what an undamped step
-still takes off the residual. With dry friction or stops the cost may have kinks. A kink can be a local minimum;
-which of them a fit finds depends on its path. Fit again from points near the estimate, and keep the least cost.
+A fit ends when the gradient vanishes. It also ends when the last step changes the cost, or the unknowns, by less than
+`tolerance`. In that case two more conditions must hold: the gradient or the residual is small; and the damping is
+small, or an undamped step would reduce the residual only a little. With dry friction or stops the cost can have kinks.
+A kink can be a local minimum, and which one a fit finds depends on its path. Fit again from points near the estimate,
+and keep the lowest cost.
 
-A start that is poor
---------------------
+Initial guesses
+---------------
 
-`equation_error` finds one without a guess, by putting the measured motion into the equations of motion.
-`fit_progressively` goes from a poor one over longer and longer parts of a record. `multistart` tries many at once.
-`measure` shows a run as sensors do, at their times, with gain, offset, drift and delay; `accelerometer` is one of them.
+`equation_error` needs no guess: it inserts the measured motion into the equations of motion. `fit_progressively` starts
+from a poor guess and fits longer and longer parts of a record. `multistart` fits from many guesses at once.
 
-Which model
------------
+Sensors
+-------
 
-`score_test` ranks terms that a model does not have yet. `compare` judges models that were fitted: by AIC and BIC, by F
-tests of nested ones, and by their errors on segments that were left out; all of it knows that residuals are correlated.
+`measure` gives the readings of sensors along a run: at their own times, with gain, offset, drift and delay.
+`accelerometer` is one such sensor.
+
+Choosing a model
+----------------
+
+`score_test` ranks terms that a model does not have yet. `compare` compares fitted models by AIC and BIC, by F tests of
+nested models, and by their errors on segments that were left out. Both allow for correlated residuals.
 
 The step size is part of the model
 ----------------------------------
 
-A fitted stiffness belongs to its step size, because a method makes every vibration a little slower or more damped than
-it is. `step_size_bias` predicts by how much a parameter is off, and takes it out (`correct=True`) of stiffness, and of
-damping where masses were fitted too or a single mode vibrates freely, from motion near resonance; `refine` fits with
-dt, dt/2, ... and extrapolates all parameters to zero, whatever the motion was.
+A fitted stiffness depends on the step size, because a numerical method makes every vibration a little slower or more
+damped. `step_size_bias` predicts this error of a parameter for motion near resonance. With `correct=True` it removes
+the error from the stiffness. It removes it from the damping too if the masses were fitted, or if a single mode vibrates
+freely. `refine` works for any motion: it fits with dt, dt/2, ... and extrapolates all parameters to dt = 0.
 
-What comes of it in two measured systems, `silverbox` and `double_pendulum_measured`, and what can be found in
-principle, in stiff joints, a vehicle and a mechanism with six constraints, is on a page,
-`experiments/identification/README.md`.
+Results for two measured systems, `silverbox` and `double_pendulum_measured`, are in
+`experiments/identification/README.md`. The page also shows what can be identified in principle: stiff joints, a
+vehicle, and a mechanism with six constraints.
 """
 
 from hhtjax.identification.arguments import Gaussian

@@ -1,4 +1,4 @@
-"""What `fit` is given, checked and brought into one form."""
+"""Checks of the arguments of `fit`, which bring them into one form."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from hhtjax.description import Array, PyTree, Real, as_float, freeze, is_array, 
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.losses import LOSSES
 
-FEW = 64  # parameters up to which a forward-mode Jacobian is the cheaper derivative
+FEW = 64  # parameters up to which a forward-mode Jacobian is cheaper than a reverse-mode gradient
 LEVENBERG_MARQUARDT = "levenberg_marquardt"
 
 
 class Gaussian(NamedTuple):
-    """A prior, normally distributed, for `fit`.
+    """A normally distributed prior of a parameter, for `fit(prior=...)`.
 
     Attributes:
-        mean, deviation: numbers, or arrays like the parameter.
+        mean, deviation: mean and standard deviation, numbers, or arrays like the parameter.
 
     Raises:
-        TypeError, ValueError: by `fit`: a mean or deviation that is not real, a deviation that is not positive.
+        TypeError, ValueError: raised by `fit`: a mean or deviation that is not real; a deviation that is not positive.
 
     >>> import jax, hhtjax
     >>> result = hhtjax.fit(lambda p: p - jax.numpy.array([2.0, 4.0]), 0.0, prior=hhtjax.Gaussian(1.0, 0.5))
-    >>> round(float(result.params), 6)                # (2 + 4 + 4 * 1)/(1 + 1 + 4): the prior weighs as four samples
+    >>> round(float(result.params), 6)                # (2 + 4 + 4 * 1)/(1 + 1 + 4): a prior like four samples
     1.666667
     """
 
@@ -60,7 +60,7 @@ def for_many():
 
 
 def is_of_optax(optimizer) -> bool:
-    """Whether it is an optimiser of optax, which is imported then."""
+    """Whether this is an optax optimiser. If optax is not imported, it cannot be one."""
     optax = sys.modules.get("optax")
     return optax is not None and isinstance(optimizer, optax.GradientTransformation)
 
@@ -76,7 +76,7 @@ def check_options(
     segments: int,
     progress: bool,
 ) -> Options:
-    """`Options` with the defaults filled in, or an error that names what is wrong."""
+    """`Options` with the defaults filled in; raises an error for a wrong argument."""
     if not (optimizer is None or optimizer == LEVENBERG_MARQUARDT or is_of_optax(optimizer)):
         raise TypeError(
             f'{caller}: `optimizer` must be an optax optimiser, "{LEVENBERG_MARQUARDT}" or None; '
@@ -101,7 +101,7 @@ def check_options(
 
 
 def check_parameters(caller: str, params0: PyTree, name: str = "params0"):
-    """params0 as a pytree of float arrays, functions among them hidden."""
+    """params0 as a pytree of float arrays; functions in it become static."""
     given, params0 = params0, freeze(params0)
     leaves = jax.tree_util.tree_leaves_with_path(params0) or jax.tree_util.tree_leaves_with_path(given)
     for path, leaf in leaves:
@@ -171,7 +171,7 @@ def check_prior(caller: str, prior: dict, params0: PyTree):
 
 
 def require_prefix(caller: str, name: str, prefix: PyTree, tree: PyTree, of: str, is_leaf: Callable | None = None):
-    """An error unless `prefix` has an entry for each leaf of `tree`, which is `of` something, or for whole branches."""
+    """Raises an error unless `prefix` has one entry for each leaf, or for whole branches, of `tree`. of: its name."""
     entries = prefix if is_leaf is None else jax.tree.map(lambda _: 0, prefix, is_leaf=is_leaf)  # None is one, too
     try:
         jax.tree.map(lambda *_: None, entries, tree)
@@ -181,7 +181,7 @@ def require_prefix(caller: str, name: str, prefix: PyTree, tree: PyTree, of: str
 
 
 def require_entries(caller: str, name: str, prefix: PyTree, tree: PyTree, of: str, is_entry: Callable, kinds: str):
-    """The same, and an error that names the first entry that is none."""
+    """`require_prefix`, after a check that every entry is of the right kind."""
     for path, entry in jax.tree_util.tree_leaves_with_path(prefix, is_leaf=is_entry):
         if not is_entry(entry):
             where = f"{name}{jax.tree_util.keystr(path)}"
@@ -190,28 +190,30 @@ def require_entries(caller: str, name: str, prefix: PyTree, tree: PyTree, of: st
 
 
 def check_records(caller: str, records, starts, prior, optimizer: str):
-    """The starts as float arrays; they and the records have one leading axis."""
+    """The starts as float arrays; checks that starts and records have the same leading axis."""
     if records is None or starts is None:
         raise ValueError(
-            f"{caller}: `records` and `starts` must be given together; received one of them. Records without "
-            "starts of their own go into residuals(params), all of them by jax.vmap."
+            f"{caller}: `records` and `starts` must be given together; received one of them. If records have no "
+            "unknowns of their own, evaluate them all in residuals(params), by jax.vmap."
         )
     starts = check_parameters(caller, starts, "starts")
     require_leading_axis(caller, "`records` and `starts`", (records, starts))
     if optimizer != LEVENBERG_MARQUARDT or prior is not None:
-        raise ValueError(f"{caller}: `records` must go with Levenberg-Marquardt and without a prior.")
+        raise ValueError(f"{caller}: `records` must be used with Levenberg-Marquardt and without a prior.")
     return starts
 
 
 def require_leading_axis(caller: str, names: str, tree: PyTree):
-    """An error unless the leaves, of the arguments so named, have a leading axis of one length."""
+    """Raises an error unless all leaves have a leading axis of the same length. names: of the arguments."""
     counts = {jnp.shape(x)[:1] for x in jax.tree.leaves(tree)}
     if len(counts) != 1 or counts == {()}:
-        raise ValueError(f"{caller}: {names} must have one leading axis in all leaves; received {sorted(counts)}.")
+        raise ValueError(
+            f"{caller}: {names} must have the same leading axis in all leaves; received the lengths {sorted(counts)}."
+        )
 
 
 def check_real(where: str, leaf: Real):
-    """An error unless `leaf` is a finite real number or array."""
+    """Raises an error unless `leaf` is a finite real number or array."""
     text = isinstance(leaf, np.ndarray) and leaf.dtype.kind not in "biufcV"  # V: the floats of 8 and 16 bits of JAX
     if not (is_array(leaf) or isinstance(leaf, (int, float))) or isinstance(leaf, bool) or text:
         raise TypeError(f"{where} must be a real number or array; received {leaf!r}.")
@@ -222,7 +224,7 @@ def check_real(where: str, leaf: Real):
 
 
 def check_transforms(caller: str, transforms: PyTree, params: PyTree, name: str = "params0"):
-    """The transform of each leaf of params, which have to be reachable by it."""
+    """The transform of each leaf of params; checks that the transform can reach the values of the leaf."""
     transforms = _completed(caller, transforms, params, "", name)
     kinds = "hhtjax.positive, bounded(), fixed"
     require_entries(caller, "transforms", transforms, params, name, tf.is_transform, kinds)
@@ -238,7 +240,7 @@ def check_transforms(caller: str, transforms: PyTree, params: PyTree, name: str 
 
 
 def _completed(caller: str, transforms: PyTree, params: PyTree, where: str, name: str):
-    """Transforms of all keys of a dict, None for those that are not given."""
+    """Transforms with all keys of the dict `params`; missing keys become None."""
     if not (isinstance(transforms, dict) and isinstance(params, dict)):
         return transforms
     if unknown := [key for key in transforms if key not in params]:

@@ -1,16 +1,18 @@
-"""What a step size does to fitted parameters, predicted from the step itself.
+"""The error of fitted parameters that is due to the step size, predicted from the step itself.
 
-A simulation with steps h has its own frequencies: its amplification matrix A(h) has eigenvalues mu = exp(s h) with
-s not quite the eigenvalue of the equations. Parameters fitted through it make mu right, so the equations with these
-parameters have eigenvalues s' that are wrong by as much. For HHT with alpha = 0 and x = w h/2
+A simulation with steps h has frequencies of its own. Its amplification matrix A(h) has eigenvalues mu = exp(s h), where
+s differs a little from the eigenvalue of the equations of motion. A fit adjusts the parameters until mu agrees with the
+data. The equations with these parameters then have eigenvalues s' that differ from s. For HHT with alpha = 0 and
+x = w h/2
 
     |s'|^2/|s|^2 = (tan x/x)^2 = 1 + (w h)^2/6 + ...        stiffness over mass
     Re s'/Re s   = 1/cos(x)^2  = 1 + (w h)^2/4 + ...        damping over mass
 
-and the response to a force is wrong too, by 1 + (w h)^2/3 + ...: where the force is known, so is the mass.
+The response to a force is wrong too, by 1 + (w h)^2/3 + ... If the force is known, this is an error of the mass.
 
-All of it is for motion at the modes' own frequencies, free or near resonance. A force at another one, W, is answered at
-W: k fitted beside a known mass is off by m W^2 (W h)^2/6 then, and no eigenvalue knows of W.
+All this holds for motion at the frequencies of the modes: free, or near resonance. A force at another frequency W
+causes motion at W. A stiffness fitted with a known mass is then off by m W^2 (W h)^2/6, which the eigenvalues do not
+show.
 """
 
 from __future__ import annotations
@@ -44,15 +46,15 @@ DRIVEN = 64  # steps from t, in which a force that depends on the time has chang
 
 @shown
 class ModeBias(NamedTuple):
-    """What the step size did to a fit, for each mode with an oscillation, slowest first, arrays (modes,).
+    """Result of `step_size_bias`: arrays (modes,), one entry for each mode that oscillates, slowest first.
 
     Attributes:
-        frequency: w = |s|, rad/s, of the motion itself; free of the bias.
-        damping: -Re s/w, the damping ratio of the motion itself; free of the bias.
+        frequency: w = |s|, rad/s, of the real motion, without the bias.
+        damping: -Re s/w, the damping ratio of the real motion, without the bias.
         wh: w h.
-        stiffness_bias: |s'|^2/|s|^2 - 1; s' belongs to the parameters as fitted with steps h.
+        stiffness_bias: |s'|^2/|s|^2 - 1, with the eigenvalue s' of the equations with the fitted parameters.
         damping_bias: Re s'/Re s - 1, 0 for an undamped mode.
-        params: the fitted ones without the bias; None if not asked for.
+        params: the fitted parameters, corrected for the bias; None with correct=False.
     """
 
     frequency: np.ndarray
@@ -83,37 +85,39 @@ def step_size_bias(
     t0: Real = 0.0,
     correct: Any = False,
 ) -> ModeBias:
-    """By how much stiffness and damping are off that were fitted through steps of dt.
+    """The error of stiffness and damping that were fitted with steps of dt.
 
-    The system is linearised about (q, v, t0): M, C = -dQ/dv, K = -dQ/dq, with the fitted params. Each of its
-    eigenvalues s' is compared with the s = log(mu)/dt of the eigenvalue mu of the real step's amplification matrix that
-    belongs to it: s is what the data have. A constraint is linearised too, and M, C, K, with the stiffness of its
-    forces, are those of the motions that it leaves. What was fitted to a motion far from the frequencies of all modes,
-    as under a force off resonance, has another bias, by that motion: `refine` knows it, this does not.
+    The system is linearised about (q, v, t0) with the fitted params: M, C = -dQ/dv, K = -dQ/dq. Each of its eigenvalues
+    s' is compared with s = log(mu)/dt, where mu is the corresponding eigenvalue of the amplification matrix of the real
+    step. The data have s. Constraints are linearised too: M, C and K are then those of the motions that the constraints
+    allow, and K includes the stiffness of the constraint forces.
+
+    The prediction does not hold for parameters fitted to motion far from the frequencies of all modes, as under a force
+    off resonance. Their bias depends on that motion; use `refine`.
 
     Args:
-        system, stepper, dt: what the parameters were fitted through.
-        params: the fitted ones.
-        q: an equilibrium, or another point about which the motion is small, on the constraint.
+        system, stepper, dt: with which the parameters were fitted.
+        params: the fitted parameters.
+        q: an equilibrium, or another point about which the motion is small. It must satisfy the constraints.
         v: velocity there, structured like q, 0 by default. t0: time there.
-        correct: True returns `params` with the smallest relative changes that give the equations the eigenvalues s
-            and the steps' response to forces ("pre-warped"). That takes the bias out of all of them where they can
-            follow: with masses fitted as well, entry by entry of M if there are several modes; or in the free
-            vibration of one mode. Otherwise the fit was a compromise between response and eigenvalues that depends on
-            the motion: then the frequencies alone are given back, damping stays as fitted, and a warning says so.
-            Parameters that the linear part does not depend on stay as they are. Or Booleans for the leaves of params,
-            or for whole branches: False for what was not fitted, such as a known mass.
+        correct: True returns corrected `params`: the smallest relative changes with which the equations have the
+            eigenvalues s and the steps' response to forces ("pre-warped"). This removes the bias of all parameters if
+            the masses were fitted too (with several modes: every entry of M), or if the motion was the free vibration
+            of one mode. Otherwise the fit was a compromise between response and eigenvalues, which depends on the
+            motion. Then only the frequencies are corrected, damping stays as fitted, and a warning says so. Parameters
+            without influence on the linearised system are unchanged. Instead of True, pass Booleans for the leaves of
+            params, or for whole branches: False for parameters that were not fitted, such as a known mass.
 
     Returns:
         A `ModeBias`; NaN for a mode that does not oscillate in the steps.
 
     Warns:
-        StepSizeWarning: params cannot follow. `refine` takes their bias out, from two fits or three.
+        StepSizeWarning: no params have the steps' response to forces. `refine` corrects them, with two or three fits.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind; dt is no positive number; q has another number of
-            coordinates than the mass, or violates a constraint; constraints that depend on each other; `correct` with
-            a dt in which a mode does not oscillate, or without a mode that does.
+        TypeError, ValueError: an argument of a wrong kind; dt is not a positive number; q has another number of
+            coordinates than the mass, or violates a constraint; dependent constraints; `correct` with a dt in which
+            some mode does not oscillate, or for a system in which no mode oscillates.
         NotImplementedError: a system with internal states or rotations.
 
     References:
@@ -137,7 +141,7 @@ def step_size_bias(
     _require_point(q, v)
     if system.internal is not None:
         raise NotImplementedError(
-            "step_size_bias: `system` has internal states, which M, C and K cannot hold; `refine` takes the bias out."
+            "step_size_bias: `system` has internal states, which M, C and K cannot represent; use `refine` instead."
         )
     require_smooth("step_size_bias", system)
     require_dense("step_size_bias", system, params)
@@ -152,10 +156,10 @@ def step_size_bias(
     if correct is False:
         return bias
     if not w.size:
-        raise ValueError("step_size_bias: `params` must let a mode oscillate, for `correct`; none does.")
+        raise ValueError("step_size_bias: `params` must let a mode oscillate, to use `correct`; no mode does.")
     if np.any(np.isnan(w)):
         raise ValueError(
-            f"step_size_bias: `dt` must let every mode oscillate, for `correct`; received {dt}, in which "
+            f"step_size_bias: `dt` must let every mode oscillate, to use `correct`; received {dt}, with which "
             f"{np.sum(np.isnan(w))} of {len(w)} do not."
         )
 
@@ -195,7 +199,7 @@ def _is_driven(system, params: PyTree, q: Array, v, t: Real, dt: Real) -> bool:
 
 
 def _linear_part(system, params: PyTree, q, v, t: Real):
-    """M, C, K about a state, (n, n) each; with a constraint, of the n - m motions that it leaves."""
+    """M, C, K about a state, (n, n) each; with m constraints, those of the n - m motions that they allow."""
     given, (q, unravel) = q, ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), q))
     M = jnp.asarray(mass_at(system, unravel(q), t, params))
     M = jnp.diag(M) if M.ndim == 1 else M
@@ -224,9 +228,9 @@ def _require_coordinates(n: int, q, v):
     shapes = [jnp.shape(x) for x in jax.tree.leaves(q)]
     size = sum(map(math.prod, shapes))
     if size != n and any(shape[-2:] == (3, 3) for shape in shapes):
-        raise NotImplementedError("step_size_bias: `q` has rotations, whose displacements are no part of it.")
+        raise NotImplementedError("step_size_bias: `q` has rotations, which are not supported.")
     if size != n:
-        raise ValueError(f"step_size_bias: `q` must be of the size of the mass, {n}; received {describe(q)}.")
+        raise ValueError(f"step_size_bias: `q` must have as many numbers as the mass, {n}; received {describe(q)}.")
     if v is not None and [jnp.shape(x) for x in jax.tree.leaves(v)] != shapes:
         raise ValueError(f"step_size_bias: `v` must have the shapes of q, {describe(q)}; received {describe(v)}.")
 
@@ -264,9 +268,9 @@ def _rates_of_steps(stepper: Stepper, dt: Real, M: Array, C: Array, K: Array) ->
 
 
 def _as_if_alone(stepper: Stepper, s) -> np.ndarray:
-    """Of an oscillator with the eigenvalue s, and steps of 1, what the steps make of exp(s); NaN without oscillation.
+    """The eigenvalue of one step of size 1 for an oscillator with eigenvalue s; NaN if the steps do not oscillate.
 
-    By these the modes of a system are told apart, whose exp(s) may be nearer to what the steps make of another.
+    Eigenvalues of the steps are assigned to modes by these values. Assigning them by exp(s) could confuse two modes.
     """
     mu: Any = np.asarray(eigenvalues(stepper, -2 * s.real, np.abs(s) ** 2))
     away = np.where(mu.imag > 0, np.abs(mu - np.exp(s)[:, None]), np.inf)
@@ -275,11 +279,12 @@ def _as_if_alone(stepper: Stepper, s) -> np.ndarray:
 
 
 # ----------------------------------------------------------------------------
-# Parameters whose equations move as the steps did: the correction of `step_size_bias`.
+# The correction of `step_size_bias`: parameters with which the equations move as the steps did.
 #
-# What the steps do to a mode is known from the eigenvalues s of their amplification matrix, and from the change of s
-# with the stiffness: a force -eps K q changes s by as much as the mode responds to forces. So no force needs to be
-# applied; with the stiffness of one part of the coordinates after the other, it shows the shapes of the modes as well.
+# The eigenvalues s of the amplification matrix give the free motion of a mode in the steps. The derivative of s with
+# respect to the stiffness gives its response to forces, because a force -eps K q changes s in proportion to that
+# response. So no force needs to be applied. Changing the stiffness of one part of the coordinates after the other also
+# shows the shapes of the modes.
 
 
 GAIN_WEIGHT = 1e-3  # frequency and damping first; the response to forces with the freedom that they leave
@@ -290,7 +295,7 @@ LEAST = 0.02  # influence of a parameter on a frequency, below which it is no st
 
 
 class Motion(NamedTuple):
-    """Of each mode: rates (modes,) and their changes (parts, modes) with the stiffness of a part of the coordinates."""
+    """For each mode: rates (modes,), and their derivatives (parts, modes) by stiffness, one part at a time."""
 
     rates: Array
     response: Any
@@ -352,9 +357,9 @@ def prewarped(
 
 def _compromise(left):
     return (
-        f"step_size_bias: no values of params have the steps' response to forces ({100 * left:.2g} % of it is left): "
-        "damping was fitted as a compromise that depends on the motion, and stays as it is; `refine` corrects it, and "
-        "stiffness that was fitted to motion far from the resonances."
+        f"step_size_bias: no values of params have the steps' response to forces ({100 * left:.2g} % of it is left). "
+        "The fitted damping is a compromise that depends on the motion, so it is not corrected. Use `refine` to "
+        "correct it, and to correct a stiffness that was fitted to motion far from the resonances."
     )
 
 

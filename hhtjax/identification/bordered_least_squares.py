@@ -1,4 +1,4 @@
-"""The least-squares problem of many records, each with unknowns of its own, inside Levenberg-Marquardt."""
+"""The least-squares problem inside Levenberg-Marquardt, for many records that each have unknowns of their own."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hhtjax.numerics.array_namespace import eigh, namespace_of, select, solve_up
 
 
 class ArrowTrial(NamedTuple):
-    """A point, and each record's problem, columns over D and reduced to k + p + 1 rows."""
+    """A point, and each record's problem there, with columns divided by D and reduced to k + p + 1 rows."""
 
     x: Any
     read: Any  # of an `Arrow` problem: r (records, m), J by the shared unknowns, (records, m, p), and by their own
@@ -42,7 +42,7 @@ def split(x: Real, count: int, p: int):
 def arrow_trial(x: np.ndarray, seen: Seen, D: np.ndarray, p: int) -> ArrowTrial:
     """The trial at x, with D from the trials before; its cost is inf where something is not finite.
 
-    seen: of residuals (records, m), and of their derivatives by k own unknowns and then p shared ones.
+    seen: residuals (records, m), and their derivatives by k own unknowns and then p shared ones.
     """
     xp, both, r = namespace_of(x), seen.J, seen.r
     count, k = len(both), both.shape[2] - p
@@ -64,7 +64,7 @@ def arrow_trial(x: np.ndarray, seen: Seen, D: np.ndarray, p: int) -> ArrowTrial:
 
 
 def _eliminated(trial: ArrowTrial, lam: Real):
-    """The damped problem without own unknowns: with T (records, k, k) and S (p, p) upper triangular,
+    """The damped problem with the own unknowns eliminated: with T (records, k, k) and S (p, p) upper triangular,
 
     T own + part (shared, 1) = 0,    S shared + seen = 0.
     """
@@ -83,9 +83,9 @@ def _eliminated(trial: ArrowTrial, lam: Real):
 class Arrow(NamedTuple):
     """Residuals f(shared, own, record) (m,) of each record, with k unknowns of its own, which are eliminated.
 
-    x holds the p shared unknowns, then those of the records. For given shared ones the own unknowns are a small
-    problem in each record; what is left of J is orthogonal to it (a Schur complement, taken by QR). The Jacobian has
-    p + k columns, whatever the number of records.
+    x holds the p shared unknowns, then those of the records. For given shared unknowns, the own unknowns of each record
+    are a small problem. The rest of J is orthogonal to the columns of this problem (a Schur complement, computed by
+    QR). The Jacobian has p + k columns, whatever the number of records.
     """
 
     f: Callable
@@ -116,11 +116,11 @@ class Arrow(NamedTuple):
         return jnp.einsum("bm,bmp->bp", pull.reshape(r.shape), wJ.reshape(J.shape))
 
     def see(self, x: Array) -> Seen:
-        """What `arrow_trial` has to know of x."""
+        """The `Seen` of x, for `arrow_trial`."""
         return self.seen(x, *self.read(x))
 
     def seen(self, x: Array, r: Array, J: Array, J_own: Array) -> Seen:
-        """The same, of what has been read."""
+        """The `Seen` of x, from the result of `read`."""
         both = jnp.concatenate([J_own, J], axis=2)
         r_hat, both_hat = self.objective.least_squares(r.ravel(), both.reshape(r.size, -1))
         bend = None if self.bend is None else self.bend(x[: self.p])
@@ -169,7 +169,7 @@ class Arrow(NamedTuple):
         return xp.concatenate([xp.sum(slopes[:, k:], axis=0), slopes[:, :k].ravel()])
 
     def weighted(self, trial):
-        """w J by a record's own unknowns and then the shared ones, and as in `Dense`."""
+        """w J, with the columns of a record's own unknowns first, and the squared factors of its rows as in `Dense`."""
         r, J, J_own = trial.read
         both = jnp.concatenate([J_own, J], axis=2)
         row = self.objective.stretch(r.ravel())
@@ -177,13 +177,13 @@ class Arrow(NamedTuple):
         return both, None if row is None else row.reshape(r.shape)
 
     def offset(self, trial: ArrowTrial) -> Real:
-        """Length of the part of the residual that a step without damping takes away, over that of the residual."""
+        """Length of the part of the residual that an undamped step removes, over that of the residual."""
         xp = namespace_of(trial.x)
         _, predicted = self.step(trial, xp.zeros_like(trial.length))
         return xp.sqrt(xp.maximum(2 * predicted, 0)) / or_one(trial.length)
 
     def length(self, trial, dx):
-        """Of J dx."""
+        """Length of J dx."""
         xp = namespace_of(trial.x)
         shared, own = split(or_one(trial.D) * dx, len(trial.R), trial.R.shape[-1])
         Jdx = xp.einsum("bip,p->bi", trial.R, shared) + xp.einsum("bik,bk->bi", trial.R_own, own)
@@ -197,12 +197,12 @@ class Arrow(NamedTuple):
         return largest_cosine(xp.concatenate([shared, own.ravel()]), trial)
 
     def estimates(self, r, J, J_own):
-        """What `Objective.estimating` says of the residuals."""
+        """`Objective.estimating` of the residuals."""
         return self.objective.estimating(r.ravel(), jnp.concatenate([J_own, J], axis=2).reshape(r.size, -1))
 
 
 def free_of_own(both: np.ndarray, bend, count: int, p: int) -> np.ndarray:
-    """The part of J, of derivatives by k own unknowns and then p shared ones, that no own unknown can make up for."""
+    """The part of the shared columns of J that the own unknowns cannot reproduce. both: k own columns, p shared."""
     xp = namespace_of(both)
     both = both.reshape(count, -1, both.shape[-1])
     k = both.shape[-1] - p

@@ -1,4 +1,4 @@
-"""Which of several models does a record support: information criteria, F tests, and errors on what was left out."""
+"""Comparison of several models of one record: information criteria, F tests, and errors on segments left out."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from hhtjax.identification.result import FitResult
 
 @shown
 class NestedTest(NamedTuple):
-    """Are the further parameters of the larger of two nested models there? Two answers.
+    """F tests of two nested models: does the record support the additional parameters of the larger one?
 
     Attributes:
-        smaller, larger: names of the models. extra: how many parameters the larger one has more, q.
-        statistic, p_value: by the covariance of the fit, which allows for correlated residuals.
-        naive_statistic, naive_p_value: the textbook's F test, as if every residual were independent noise.
+        smaller, larger: names of the models. extra: q, the number of additional parameters of the larger one.
+        statistic, p_value: from the covariance of the fit, which allows for correlated residuals.
+        naive_statistic, naive_p_value: the textbook F test, which assumes that every residual is independent noise.
     """
 
     smaller: str
@@ -44,24 +44,26 @@ class NestedTest(NamedTuple):
 
 
 def _told(test: NestedTest) -> str:
-    """A test in words, with a doubt where both answers cannot be right, as those of two smaller models."""
+    """A test in words. If the two p values contradict each other, it names a possible reason: a wrong `absent`."""
     doubt = ", if `absent` is right" if 1e3 * test.p_value < test.naive_p_value > 0.05 else ""
     return f"{test.p_value:.2g} ({test.naive_p_value:.2g}) against {test.smaller}{doubt}"
 
 
 @shown
 class Comparison(NamedTuple):
-    """What `compare` found; arrays have an entry for each of the M models.
+    """Result of `compare`. Arrays have an entry for each of the M models.
 
     Attributes:
-        names: of the models.
-        parameters: (M,), how many were fitted, the starts of records included.
-        observations: n, residuals that are not missing. effective: how many independent ones they are worth.
-        rms: (M,), root of the mean squared (weighted) residual.
-        aic, bic: (M,), only their differences matter.
-        tests: a `NestedTest` for each pair of nested models without a third between them.
-        held_out: (M, folds), rms of each segment, by the parameters fitted to the others; None if not asked for.
-        converged: (M, folds), whether these fits did; None if not asked for.
+        names: names of the models.
+        parameters: (M,), number of fitted parameters, including the starts of records.
+        observations: n, the number of residuals that are not missing.
+        effective: n_e, the number of independent observations that would carry as much information.
+        rms: (M,), root mean square of the (weighted) residual.
+        aic, bic: (M,); only differences between models matter.
+        tests: a `NestedTest` for each pair of nested models with no third model between them.
+        held_out: (M, folds), rms of the residual on each segment, with the parameters fitted to the other segments;
+            None without `residuals`.
+        converged: (M, folds), whether these fits converged; None without `residuals`.
     """
 
     names: tuple
@@ -77,14 +79,14 @@ class Comparison(NamedTuple):
 
     @property
     def cross_validated(self) -> Any:
-        """(M,), root of the mean square of `held_out` over segments; None without."""
+        """(M,), root mean square of `held_out` over the segments; None without `held_out`."""
         return None if self.held_out is None else np.sqrt(np.mean(self.held_out**2, axis=1))
 
     @property
     def behind(self) -> Any:
-        """(M, 2), held-out mean square less that of the best model, and the standard error of this difference.
+        """(M, 2): difference of the held-out mean square from that of the best model, and its standard error.
 
-        With the difference d_g of each of G segments: mean(d) and sd(d)/sqrt(G). None without cross-validation.
+        With the difference d_g of each of G segments they are mean(d) and sd(d)/sqrt(G). None without cross-validation.
         """
         if self.held_out is None:
             return None
@@ -94,10 +96,10 @@ class Comparison(NamedTuple):
 
     @property
     def chosen(self) -> str:
-        """The model to take.
+        """Name of the recommended model.
 
-        With cross-validation the one of fewest parameters that is behind the best by no more than the standard error
-        of the difference (Breiman, Friedman, Olshen, Stone 1984, Sec. 3.4.3); else that of the least BIC.
+        With cross-validation: the model with the fewest parameters among those whose difference from the best model is
+        at most its standard error (Breiman, Friedman, Olshen, Stone 1984, Sec. 3.4.3). Without: that of lowest BIC.
         """
         if self.held_out is None:
             return self.names[int(np.argmin(self.bic))]
@@ -105,7 +107,7 @@ class Comparison(NamedTuple):
         return self.names[int(np.argmin(np.where(close, self.parameters, np.inf)))]
 
     def summary(self) -> str:
-        """The table as text; p values have the model they belong to, and in brackets those of the textbook."""
+        """The table as text. Each p value names the smaller model; the textbook's p value is in brackets."""
         return as_text(self._table())
 
     def _table(self) -> Table:
@@ -123,8 +125,8 @@ class Comparison(NamedTuple):
             for i, (away, error) in enumerate(self.behind):
                 words = f"{away / error:.1f} standard errors" if away else "best"
                 rows[i + 1] += [f"{self.cross_validated[i]:.5g}", words]
-        worth = f"{self.observations} observations, worth {self.effective:.0f} independent ones"
-        return Table(f"Comparison: {worth}; takes {self.chosen!r}", rows)
+        worth = f"{self.observations} observations, as informative as {self.effective:.0f} independent ones"
+        return Table(f"Comparison: {worth}; chosen: {self.chosen!r}", rows)
 
 
 def compare(
@@ -137,37 +139,40 @@ def compare(
     progress: bool = False,
     **options: Any,
 ) -> Comparison:
-    """Several models of the same measurements: AIC and BIC, F tests of nested ones, errors on segments left out.
+    """Compares models of the same measurements: AIC and BIC, F tests of nested models, errors on segments left out.
 
-    Residuals of a fit are correlated, because no model is quite right, and then n of them say less than n independent
-    ones: textbook criteria take in term after term. Here the covariance C of a fit, from how much segments of the
-    record disagree, says how much less. With S_m the weighted sum of squares of model m, k_m its parameters, and
-    n_e = n/d, where d = tr(naive^-1 C)/p >= 1 is the design effect of the model with most parameters,
+    Residuals of a fit are correlated, because no model is quite right. Then n residuals carry less information than n
+    independent ones, and textbook criteria accept too many terms. The covariance C of a fit, from the scatter between
+    segments of the record, measures this loss. With the weighted sum of squares S_m of model m, its number of
+    parameters k_m, and n_e = n/d, where d = tr(naive^-1 C)/p >= 1 is the design effect of the model with most
+    parameters,
 
-        AIC = n_e log(S_m/n) + 2 k_m,        BIC = n_e log(S_m/n) + k_m log n_e,
+        AIC = n_e log(S_m/n) + 2 k_m,        BIC = n_e log(S_m/n) + k_m log n_e.
 
-    and for q further parameters x of a nested model, absent at x0, whose variances have f `degrees` of freedom or more
-    (Hotelling's T^2),
+    The F test is for the q additional parameters x of a nested model. They have no effect at x0, and their variances
+    have at least f `degrees` of freedom (Hotelling's T^2):
 
-        (f - q + 1)/f (x - x0)^T C_xx^-1 (x - x0)/q ~ F(q, f - q + 1),
+        (f - q + 1)/f (x - x0)^T C_xx^-1 (x - x0)/q ~ F(q, f - q + 1).
 
-    beside the textbook's ((S_0 - S_1)/q)/(S_1/(n - k_1)) ~ F(q, n - k_1). One model is nested in another if the names
-    of its fitted parameters are among those of the other.
+    The textbook test is given too: ((S_0 - S_1)/q)/(S_1/(n - k_1)) ~ F(q, n - k_1). A model is nested in another if the
+    names of its fitted parameters are among those of the other.
 
-    With `residuals` each model is also fitted with one of `folds` segments left out, from its estimate on, and judged
-    by the residuals of this segment: no formula, and no trust in noise that is white. Segments are contiguous, so that
-    correlated residuals do not tell the fit about their neighbours that were left out.
+    With `residuals` each model is cross-validated: it is fitted again, from its estimate on, with one of `folds`
+    segments left out, and evaluated on that segment. This needs no formula and no assumption of white noise. Segments
+    are contiguous, so that the segment left out is hardly correlated with the rest.
 
     Args:
         fits: {name: `FitResult`, with covariance}, all of the same measurements with the same weights.
-        residuals: the function that was fitted, or {name: function}; for errors on segments left out. None: without.
-        folds: how many segments, cut as those of the covariance; each long against the correlation time. Fewer where
-            some would have no residual to judge by.
-        absent: the value at which a parameter of nested models has no effect, or {parameter: value}, by the names in
-            `FitResult.summary()`, 0 for others, such as a constant in the smaller model's function. Where that model
-            holds it fixed, its value is taken. The summary doubts it where only the first of two p values is tiny.
-        always: Booleans, as `weights` of `fit`: True for residuals that no fit leaves out, and by which none is judged,
-            such as the first samples, where they alone tell the initial state.
+        residuals: the function that was fitted, or {name: function}, for the errors on segments left out. None: no
+            cross-validation.
+        folds: number of segments, cut like those of the covariance. Each must be long compared with the correlation
+            time. Segments without any residual to evaluate do not count.
+        absent: the value at which an additional parameter has no effect, or {parameter: value} with the names in
+            `FitResult.summary()`; 0 for the others. It is needed if the smaller model has a constant in its function
+            instead of the parameter. If the smaller model has the parameter as a fixed one, that value is used. The
+            summary questions `absent` if the first p value is tiny and the textbook's is not.
+        always: Booleans, as `weights` of `fit`: True for residuals that are in every fit and are never evaluated, such
+            as the first samples if they alone determine the initial state.
         progress: show in one line on stderr which fit is running.
         options: loss, prior, scale, max_iterations, tolerance, as they were given to `fit`.
 
@@ -176,8 +181,8 @@ def compare(
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind; fewer than two fits; fits without covariance, made inside
-            jit, or with different numbers of observations; residuals not of these fits; fewer than two segments to
-            judge by. NotImplementedError: segments left out of fits with records.
+            jit, or with different numbers of observations; residuals that are not those of the fits; fewer than two
+            segments to evaluate. NotImplementedError: cross-validation of fits with records.
 
     References:
         Akaike, IEEE Trans. Autom. Control 19 (1974); Schwarz, Ann. Stat. 6 (1978); Rao, Scott, J. Am. Stat. Assoc. 76
@@ -236,25 +241,25 @@ def _check_functions(residuals: PyTree, fits: dict):
     """{name: residual function} of all models."""
     functions = residuals if isinstance(residuals, dict) else dict.fromkeys(fits, residuals)
     if functions.keys() != fits.keys():
-        raise ValueError(f"compare: `residuals` must be of {', '.join(fits)}; received {', '.join(functions)}.")
+        raise ValueError(f"compare: `residuals` must have the keys {', '.join(fits)}; received {', '.join(functions)}.")
     for name, function in functions.items():
         if fits[name].starts is not None:
-            raise NotImplementedError(f"compare: `fits[{name!r}]` has records: no segments of them can be left out.")
+            raise NotImplementedError(f"compare: `fits[{name!r}]` has records, of which no segments can be left out.")
         require_function("compare", "residuals", function, "residuals(params)")
         require_residuals_of(name, fits[name], function)
     return functions
 
 
 def _require_known(absent: PyTree, results: list):
-    """An error for a name in `absent` that no model has."""
+    """Raises an error for a name in `absent` that no model has."""
     known = {name for result in results for name in parameter_names(result.params)}
     if isinstance(absent, dict) and (unknown := [name for name in absent if name not in known]):
         names = ", ".join(sorted(known))
-        raise ValueError(f"compare: `absent` must be of parameters, {names}; received one for {unknown[0]!r}.")
+        raise ValueError(f"compare: `absent` must have keys among {names}; received {unknown[0]!r}.")
 
 
 def _require_equal_weights(names: tuple, results: list):
-    """Their sums of squares are not of one kind, where the weights are not; the order is that of each model's."""
+    """Raises an error if the fits have different weights; the weights of each model are compared sorted."""
     weights = [np.sort(np.concatenate([np.ravel(w) for w in weights_of(x)])) for x in results]
     for name, w in zip(names, weights, strict=True):
         if w.shape != weights[0].shape or not np.allclose(w, weights[0]):
@@ -262,7 +267,7 @@ def _require_equal_weights(names: tuple, results: list):
 
 
 def _nested_tests(fits: dict, costs: dict, n: int, absent):
-    """A `NestedTest` of each pair of nested models without a third between them."""
+    """A `NestedTest` of each pair of nested models with no third model between them."""
     own = {name: set(np.asarray(parameter_names(x.params))[x.free]) for name, x in fits.items()}
     pairs = [(a, b) for a in fits for b in fits if own[a] < own[b] and _same_constants(fits[a], fits[b], own[b])]
     for smaller, larger in pairs:

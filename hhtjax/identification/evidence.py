@@ -1,7 +1,6 @@
-"""What the residuals of a fit are worth: how many there are, whether they are white, how many independent ones they
-equal.
+"""Statistics of the residuals of a fit: their number, their whiteness, and their effective number.
 
-Numbers of a finished fit, by NumPy: nothing here is traced.
+All functions take a finished fit and use NumPy; nothing here is traced.
 """
 
 from __future__ import annotations
@@ -27,8 +26,10 @@ LEAST = 5  # samples for each lag
 
 
 class Residuals(NamedTuple):
-    """Leaves of the residuals, each (entries along its `time_axis`, others): as returned, weighted with 0 where they
-    are missing, and where they are present."""
+    """Leaves of the residuals, each of shape (entries along its `time_axis`, others).
+
+    plain: as returned. weighted: times the weights, 0 where missing. present: Booleans.
+    """
 
     names: list
     plain: list
@@ -42,7 +43,7 @@ def weights_of(result: FitResult) -> list:
 
 
 def residuals_of(result: FitResult) -> Residuals:
-    """Of a fit that is finished."""
+    """The `Residuals` of a finished fit."""
     weights = weights_of(result)
     names, plain, weighted, present = [], [], [], []
     for (path, leaf), weight in zip(jax.tree_util.tree_leaves_with_path(result.residual), weights, strict=True):
@@ -58,12 +59,12 @@ def residuals_of(result: FitResult) -> Residuals:
 
 
 def count(residuals: Residuals) -> int:
-    """Of residuals that are not missing."""
+    """Number of residuals that are not missing."""
     return int(sum(np.sum(x) for x in residuals.present))
 
 
 def used_by_starts(result: FitResult) -> int:
-    """Residuals that the starts of records take; 0 without."""
+    """Number of residuals that are used up by fitting the starts of records; 0 without records."""
     if result.starts is None:
         return 0
     starts = jax.tree.leaves(result.starts)
@@ -73,8 +74,10 @@ def used_by_starts(result: FitResult) -> int:
 
 
 def design_effect(uncertainty: Uncertainty) -> float:
-    """tr(naive^-1 C)/p of the p parameters that are determined: the mean factor by which correlated residuals enlarge
-    variances (Rao and Scott, J. Am. Stat. Assoc. 76, 1981, 221-230); less than 1 where they make them smaller."""
+    """tr(naive^-1 C)/p over the p determined parameters: mean factor by which correlated residuals enlarge variances.
+
+    It is less than 1 if they reduce the variances (Rao and Scott, J. Am. Stat. Assoc. 76, 1981, 221-230).
+    """
     known = ~np.asarray(uncertainty.undetermined)
     naive, C = (np.asarray(x)[np.ix_(known, known)] for x in (uncertainty.naive, uncertainty.covariance))
     size = np.sqrt(np.diagonal(naive))
@@ -85,16 +88,16 @@ def design_effect(uncertainty: Uncertainty) -> float:
 
 
 def effective_observations(observations: int, uncertainty) -> float:
-    """How many independent ones would be worth as much: n / max(design effect, 1)."""
+    """Number of independent observations with as much information: n / max(design effect, 1)."""
     return observations / max(design_effect(uncertainty), 1.0)
 
 
 def whiteness(residuals: Residuals):
-    """Autocorrelation at lag 1, and p value and lags of Ljung and Box's test that there is none; None if too few.
+    """(autocorrelation at lag 1, p value, lags) of Ljung and Box's test for white residuals; None if there are too few.
 
     Q = n (n + 2) sum_k rho_k^2/(n - k), k = 1 .. lags, is chi-squared with as many degrees of freedom as there are lags
-    (Biometrika 65, 1978, 297-303); n - k is the number of pairs, of samples that are present. The Q of all columns are
-    added, but for leaves that are no record, of fewer than 5 samples.
+    (Biometrika 65, 1978, 297-303). n - k is the number of pairs in which both samples are present. The Q of all columns
+    are added. Leaves of fewer than 5 samples are not time series and are left out.
     """
     leaves = zip(residuals.weighted, residuals.present, strict=True)
     records = [(r, present) for r, present in leaves if len(r) >= LEAST]
@@ -115,8 +118,7 @@ def whiteness(residuals: Residuals):
 
 
 def fades(residuals: Residuals) -> bool:
-    """Whether the last third of the residuals, in all, is less than a third as large as the first: of records that die
-    away."""
+    """Whether the residuals decay: the rms of the last third is less than a third of that of the first third."""
     first, last = 0.0, 0.0
     for r in residuals.weighted:
         third = len(r) // 3
@@ -126,7 +128,7 @@ def fades(residuals: Residuals) -> bool:
 
 
 def chi_squared_tail(x: Real, degrees: Real) -> float:
-    """Probability of more than x, of an integer number of degrees of freedom: a finite sum."""
+    """Probability that chi-squared exceeds x, for an integer number of degrees of freedom (a finite sum)."""
     y, odd = float(x) / 2, degrees % 2
     if not 0 < y < math.inf:
         return math.nan if math.isnan(y) else float(y <= 0)
@@ -135,7 +137,7 @@ def chi_squared_tail(x: Real, degrees: Real) -> float:
 
 
 def f_tail(x: Real, numerator: int, denominator: Real) -> float:
-    """Probability of more than x in Fisher's F distribution; NaN where there are no degrees of freedom."""
+    """Probability that Fisher's F exceeds x; NaN without degrees of freedom."""
     if denominator <= 0 or not math.isfinite(x):
         return math.nan
     at = denominator / (denominator + numerator * max(x, 0.0))
@@ -143,5 +145,5 @@ def f_tail(x: Real, numerator: int, denominator: Real) -> float:
 
 
 def rms(r: Any, present: Any) -> float:
-    """Root of the mean square of what is present."""
+    """Root mean square of the entries that are present."""
     return float(np.sqrt(np.sum(np.where(present, r, 0) ** 2) / max(np.sum(present), 1)))

@@ -1,13 +1,13 @@
-"""The linear least-squares problem inside Levenberg-Marquardt, of which each residual may depend on every unknown.
+"""The linear least-squares problem inside Levenberg-Marquardt, for residuals that may all depend on every unknown.
 
-A problem evaluates a point x into a trial with its cost, and finds from it the damped step
+A problem evaluates a point x, and returns a trial with its cost. From the trial it finds the damped step
 
-    min_dx |r + J dx|^2 + lam |D dx|^2,      D: the largest norms that the columns of J have had (More 1978)
+    min_dx |r + J dx|^2 + lam |D dx|^2,      D: the largest norms that the columns of J have had (More 1978).
 
-so that a parameter which loses its influence on the way does not run away.
+This D keeps a parameter from running away when it loses its influence.
 
-Towards a bound of a parameter, which a transform has put at an infinite x, J^T J vanishes faster than the slope J^T r.
-What makes a good step there is the second derivative of the transform itself: see `bent`.
+A transform maps a bound of a parameter to an infinite x. Towards it J^T J vanishes faster than the slope J^T r. The
+second derivative of the transform then gives a good step: see `bent`.
 """
 
 from __future__ import annotations
@@ -41,8 +41,9 @@ def with_jacobian(f: Callable, x: Array):
 
 
 def triangle(A: np.ndarray) -> np.ndarray:
-    """R of A = Q R. Of a tall matrix by QR of parts of its rows, then of what is left of them, and so on: LAPACK's goes
-    through the whole of it for every column.
+    """R of A = Q R. The rows of a tall matrix are reduced part by part, and the results again, until one part is left.
+
+    This is faster than LAPACK's QR, which goes through the whole matrix for every column.
 
     >>> A = jnp.sin(jnp.arange(9000.0)).reshape(3000, 3)
     >>> R = triangle(A)
@@ -66,11 +67,11 @@ def blank(problem, x: Array) -> DenseTrial:
 
 
 def bent(bend: np.ndarray, slope: np.ndarray, square: np.ndarray) -> np.ndarray:
-    """Roots of what is added to the diagonal of J^T J (`square`) for transformed unknowns whose bound is ahead.
+    """Square roots of the terms added to the diagonal of J^T J (`square`) for unknowns that move towards a bound.
 
-    A transform p(x) gives the second derivative of the cost a part of its own, `slope` p''/p' with slope = J^T r, which
-    is positive on the way to a bound: J^T J is made as large, so that the step there is 1/|bend|, not J^T r/J^T J. At
-    a minimum inside the bounds it is 0 (Coleman, Li 1996: the same term, for bounds on p itself).
+    A transform p(x) adds `slope` p''/p' to the second derivative of the cost, with slope = J^T r. On the way to a bound
+    this is positive. The diagonal of J^T J is raised to it, so that the step is 1/|bend| instead of J^T r/J^T J. At a
+    minimum inside the bounds the term is 0 (Coleman, Li 1996: the same term, for bounds on p itself).
     """
     xp = namespace_of(bend)
     return xp.sqrt(xp.maximum(slope * bend - square, 0))
@@ -82,7 +83,7 @@ def deviation(trial: DenseTrial) -> Array:
 
 
 def or_one(x: Real) -> np.ndarray:
-    """x, to divide by."""
+    """x with 1 instead of 0, to divide by."""
     return namespace_of(x).where(x == 0, 1, x)
 
 
@@ -99,7 +100,7 @@ def bending(before, after, J, row):
 
 
 class Seen(NamedTuple):
-    """What an evaluation at a point tells."""
+    """Result of an evaluation at a point."""
 
     r: Array  # of the least-squares problem, (m,)
     J: Any  # (m, p)
@@ -109,7 +110,7 @@ class Seen(NamedTuple):
 
 
 class DenseTrial(NamedTuple):
-    """A point, and the least-squares problem there, its columns over D and reduced to p rows."""
+    """A point, and the least-squares problem there, with columns divided by D and reduced to p rows."""
 
     x: Any
     read: Any  # of a `Dense` problem: r, J
@@ -155,18 +156,18 @@ class Dense(NamedTuple):
         return with_jacobian(self.f, x)
 
     def slopes(self, x: Array) -> Array:
-        """The gradient of the cost, of all that there is: (1, p)."""
+        """The gradient of the cost: (1, p)."""
         J, pull, _ = self.objective.estimating(*self.read(x))
         return (pull @ J)[None, :]
 
     def see(self, x: Array) -> Seen:
-        """What `dense_trial` has to know of x."""
+        """The `Seen` of x, for `dense_trial`."""
         r, J = self.read(x)
         bend = None if self.bend is None else self.bend(x)
         return Seen(*self.objective.least_squares(r, J), self.objective.cost(r), bend, (r, J))
 
     def estimates(self, r: Array, J: Array):
-        """What `Objective.estimating` says of the residuals."""
+        """`Objective.estimating` of the residuals."""
         return self.objective.estimating(r, J)
 
     def look(self, x: Array, D: Array) -> DenseTrial:
@@ -203,13 +204,13 @@ class Dense(NamedTuple):
         return self.objective.scaled(J), self.objective.stretch(r)
 
     def offset(self, trial: DenseTrial) -> Real:
-        """Length of the part of the residual that a step without damping takes away, over that of the residual."""
+        """Length of the part of the residual that an undamped step removes, over that of the residual."""
         xp = namespace_of(trial.x)
         reached = trial.s > 100 * float(jnp.finfo(trial.s.dtype).eps) * trial.s[0]
         return xp.linalg.norm(xp.where(reached, trial.z, 0)) / or_one(trial.length)
 
     def length(self, trial: DenseTrial, dx: Array) -> Array:
-        """Of J dx."""
+        """Length of J dx."""
         return namespace_of(trial.x).linalg.norm(trial.s * (trial.V.T @ (trial.D * dx)))
 
     def cosine(self, trial) -> Real:

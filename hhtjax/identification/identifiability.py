@@ -1,4 +1,4 @@
-"""Words for what residuals do not determine: the combination of parameters, by name."""
+"""Messages on parameters, and combinations of parameters, that the residuals do not determine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hhtjax.identification.evidence import count, residuals_of, used_by_starts
 if TYPE_CHECKING:
     from hhtjax.identification.result import FitResult
 
-BEYOND = "the loss is flat there, with residuals beyond its bend (`weights` is one over the noise)"
+BEYOND = "most residuals are so large that the robust loss is flat there (`weights` should be one over the noise)"
 
 
 class IdentifiabilityWarning(UserWarning):
@@ -31,17 +31,17 @@ def parameter_names(params: PyTree):
 
 
 def parameter_values(params: PyTree) -> np.ndarray:
-    """The number of each entry, in the same order: (p,)."""
+    """The value of each entry, in the order of `parameter_names`: (p,)."""
     return np.concatenate([np.ravel(x) for x in jax.tree.leaves(freeze(params))])
 
 
 def undetermined_combinations(
     names: np.ndarray, values: np.ndarray, singular_values: Array, directions: Array, num_residuals: int
 ):
-    """A phrase for each combination of parameters that does not matter to the residuals.
+    """A phrase for each combination of parameters that has no effect on the residuals.
 
     Args:
-        names, values: of the p parameters. singular_values, directions: those of `Uncertainty`.
+        names, values: names and values of the p parameters. singular_values, directions: those of `Uncertainty`.
         num_residuals: number of rows of the Jacobian.
 
     >>> import numpy as np
@@ -56,7 +56,7 @@ def undetermined_combinations(
 
 
 def _sparse_basis(rows: np.ndarray) -> np.ndarray:
-    """The same row space with as many zeros as elimination with pivoting gives; largest entries one."""
+    """A basis of the same row space with many zeros, by elimination with pivoting; largest entry of a row: one."""
     rows = rows / np.maximum(np.abs(rows).max(axis=1, keepdims=True, initial=0), 1e-300)
     free = list(range(len(rows)))
     for _ in range(len(rows)):
@@ -70,7 +70,7 @@ def _sparse_basis(rows: np.ndarray) -> np.ndarray:
 
 
 def _phrase(names, direction, values: np.ndarray) -> str:
-    """Direction: relative changes that cancel."""
+    """The phrase for a direction: relative changes of the parameters that together have no effect."""
     at = np.flatnonzero(np.abs(direction) > 1e-4)
     names, direction = [names[i] for i in at], direction[at] / direction[at[0]]
     if len(names) == 1:
@@ -93,8 +93,10 @@ def _phrase(names, direction, values: np.ndarray) -> str:
 
 
 def why_undetermined(result):
-    """Names of the parameters of a fit without a standard error, and why: "the residuals determine a, b only through
-    their product". Nothing, where all have one."""
+    """Names of the parameters without a standard error, and the reason in words; empty if all have one.
+
+    Example of a reason: "the residuals determine a, b only through their product".
+    """
     believed, free = result.uncertainty, result.free
     flags = np.asarray(believed.undetermined)
     if not flags.any():
@@ -111,7 +113,7 @@ def why_undetermined(result):
 
 
 def warn_undetermined(caller: str, result: FitResult, stacklevel: int):
-    """An `IdentifiabilityWarning` that names parameters and combinations; silent where all are determined."""
+    """Warns with `IdentifiabilityWarning`, naming parameters and combinations, unless all are determined."""
     names, why = why_undetermined(result)
     if names:
         message = f"{caller}: no standard error for {', '.join(names)}: {why}."

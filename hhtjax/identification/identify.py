@@ -67,74 +67,81 @@ def fit(
     mesh: Mesh | None = None,
     chunk: int = 1,
 ) -> FitResult:
-    """The parameters that minimise the sum of squares of `residuals(params)`.
+    """Finds the parameters that minimise the sum of squares of `residuals(params)`.
 
     Args:
-        residuals: params -> any pytree of real arrays; traceable by JAX, so that its derivatives are exact.
-        params0: where to start, any pytree of real numbers and arrays; functions in it, as in an `equinox.Module`, stay
-            as they are.
-        optimizer: "levenberg_marquardt" with forward-mode Jacobians, a column for each parameter; or any optax
-            optimiser, driven by reverse-mode gradients of the cost. None: the first for up to 64 free
-            parameters, optax.lbfgs() for more.
-        records: several experiments, or windows of one: any pytree whose leaves have a leading axis, one entry for
-            each. Then `residuals(params, start, record)` is of one record.
-        starts: guesses of what belongs to one record alone, such as its initial state: a pytree with the same leading
-            axis. It is fitted too, and eliminated from each step, which is solved for the parameters alone (by a
-            Schur complement): so the Jacobian has columns for one start only, however many records there are.
-            Levenberg-Marquardt, without a prior.
+        residuals: params -> any pytree of real arrays. JAX must be able to trace it, so that its derivatives are exact.
+        params0: initial guess, any pytree of real numbers and arrays. Functions in it, as in an `equinox.Module`, stay
+            unchanged.
+        optimizer: "levenberg_marquardt", with forward-mode Jacobians, one column for each parameter; or any optax
+            optimiser, with reverse-mode gradients of the cost. None: Levenberg-Marquardt for up to 64 free parameters,
+            optax.lbfgs() for more.
+        records: several experiments, or windows of one: any pytree whose leaves have a leading axis, with one entry for
+            each record. Then `residuals(params, start, record)` returns the residuals of one record.
+        starts: guesses of the unknowns that belong to a single record, such as its initial state: a pytree with the
+            same leading axis. They are fitted too. Each step eliminates them (by a Schur complement) and solves for the
+            parameters alone. So the Jacobian has the columns of one start only, however many records there are. Needs
+            Levenberg-Marquardt and no prior.
         transforms: for each leaf of params0, or for whole branches: `positive`, `bounded(lower, upper)`, `fixed`,
-            or None for neither. Keys of dicts may be left out, for None.
-        scale: typical size of each parameter: a pytree like params0, whose leaves are numbers or arrays of
-            the shape of theirs. The optimiser works on params/scale, if no transform is given. Default: |params0|,
-            or 1 where that is 0. Levenberg-Marquardt scales itself, and uses it for its step tolerance only.
+            or None for no transform. Keys of dicts may be left out, which means None.
+        scale: typical size of each parameter: a pytree like params0, whose leaves are numbers or arrays with the shape
+            of the parameter. The optimiser works on params/scale where no transform is given. Default: |params0|, or 1
+            where that is 0. Levenberg-Marquardt does its own scaling and uses this one only in its test of small steps.
         weights: w, for each leaf of the residuals, or for whole branches: numbers, or arrays over their leading
-            axes; one over the standard deviation of the noise. 0 or False: a missing sample, whose residual may be NaN.
+            axes. A weight is one over the standard deviation of the noise. 0 or False marks a missing sample, whose
+            residual may be NaN.
         loss: rho, robust against outliers: "huber", "soft_l1", "cauchy", or an elementwise function with
-            rho(z) = z for small z. It bends where w r is about 1, so that weights matter; standard errors are those of
-            an M-estimate. None: rho(z) = z.
+            rho(z) = z for small z. The loss departs from a square where |w r| is about 1, so give weights. Standard
+            errors are then those of an M-estimate. None: rho(z) = z.
         prior: for each leaf of params0, or for whole branches: `Gaussian(mean, deviation)`, or None. It adds
-            1/2 ((p - mean)/deviation)^2, so that w r should have unit variance.
+            1/2 ((p - mean)/deviation)^2 to the cost, so choose weights with which w r has unit variance.
         max_iterations: default 200, or 1000 with an optax optimiser.
-        tolerance: relative, on the cosine between residual and Jacobian columns; or, where that is less than
-            10 sqrt(tolerance), on the change of the cost and on the scaled step. With optax: the relative change of
-            the cost, five times running.
-        covariance: False leaves out the covariance, which with optax costs one forward-mode Jacobian.
-        segments: into how many parts, each long against the correlation time of the residuals, the leaves of the
-            residuals are cut: how much these disagree gives the standard errors (the cluster covariance of
-            `Uncertainty`). Of `records` whole ones, where that makes 8 and more than there are parameters.
-        progress: show cost and step of the last iteration in one line on stderr, and why it stopped.
-        executor: whose workers evaluate `records`, as for `parallel_map`. What comes back of each is a triangle, which
-            is as large as its numbers of unknowns; residuals and Jacobians do so once, at the minimum, for standard
-            errors. By Levenberg-Marquardt, outside jit; its steps are not bent (geodesic acceleration), which takes the
-            rows, so there may be more of them. The minimum is the same.
-        mesh: devices of the CPU that do so, in the place of an executor: `jax.make_mesh((2,), ("records",))`.
-        chunk: records in a task of an executor.
+        tolerance: relative. The fit has converged when the cosine between the residual and each column of the Jacobian
+            is at most tolerance. It has also converged when this cosine is below 10 sqrt(tolerance) and the change of
+            the cost, or the scaled step, is at most tolerance. With optax: the relative change of the cost, five times
+            in a row.
+        covariance: False leaves out the covariance. With optax the covariance costs one forward-mode Jacobian.
+        segments: number of parts into which the leaves of the residuals are cut. Each part must be long compared with
+            the correlation time of the residuals. Standard errors come from the scatter between the parts (the cluster
+            covariance of `Uncertainty`). With `records`, parts are made of whole records if this gives at least 8
+            parts, and more parts than parameters.
+        progress: show cost and step of the last iteration in one line on stderr, and at the end why the fit stopped.
+        executor: its workers evaluate the `records`, as for `parallel_map`. Needs Levenberg-Marquardt, and a call
+            outside jit. A worker returns a small triangular matrix for each record, with one row and column for each
+            unknown. Residuals and Jacobians are returned once, at the minimum, for the standard errors. Steps have no
+            geodesic acceleration, which would need the Jacobians, so the fit may take more iterations. The minimum is
+            the same.
+        mesh: CPU devices that evaluate the records instead of an executor: `jax.make_mesh((2,), ("records",))`.
+        chunk: number of records in each task of the executor.
 
-    A function is traced and compiled once, and anew where something that it reads from outside differs, as `simulate`
-    says; arrays are compared by their bytes. Arrays of floats are then data, if what is computed from them can be
-    traced: a loop over records of one length, in which `residuals` read a variable, compiles for the first and for the
-    second alone. What takes a number out of an array, as `float(y[0])` or `if y.max() > 1`, is compiled for each.
+    Compilation: `residuals` is traced and compiled once, and again when a value that it reads from outside has changed,
+    as for `simulate`. Arrays are compared by their bytes. Float arrays that have changed become inputs of the compiled
+    program, if the computation with them can be traced. So a loop over records of equal length, in which `residuals`
+    reads a variable, compiles for the first two records only. Residuals that take a number out of such an array, as
+    `float(y[0])` or `if y.max() > 1`, are compiled for every record.
 
-    Estimates have derivatives, forward and reverse, in all that a fit is given and its residuals read, but where it
-    starts: those of the minimum, H dx + (dg/dd) dd = 0 with g = dc/dx the slope of the cost and H = dg/dx, by the
-    implicit function theorem. They need a fit that has converged: look at `result.code`, make `tolerance` small.
+    Derivatives: estimates have forward and reverse derivatives with respect to all inputs of the fit and to all values
+    that its residuals read, except the initial guess. They are the derivatives of the minimum, by the implicit function
+    theorem: H dx + (dg/dd) dd = 0, with data d, the slope of the cost g = dc/dx, and H = dg/dx. They are valid only if
+    the fit has converged: check `result.code`, and use a small `tolerance`.
 
-    Residuals may simulate under error control, `dt=adaptive(...)`, in `sweep` too: Levenberg-Marquardt freezes the
-    steps, fits, and chooses again, until the estimates stay to a tenth of their standard errors; `result.choices` tells
-    how often. Tolerances that leave more than the noise end as "the estimates change whenever steps are chosen anew".
+    Error control: residuals may simulate with `dt=adaptive(...)`, also in `sweep`. Levenberg-Marquardt fits with frozen
+    steps, chooses the steps again at the estimate, and repeats this until the estimates change by less than a tenth of
+    their standard errors. `result.choices` is the number of repetitions. If the error control leaves errors larger than
+    the noise, the fit ends with "the estimates change whenever steps are chosen anew".
 
     Returns:
-        A `FitResult`. Inside jit or vmap, look at `result.code`; outside, trouble is raised or warned about.
+        A `FitResult`. Outside jit and vmap, problems raise an error or a warning. Inside them, check `result.code`.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind; a start that a transform excludes; no free parameter;
-            residuals that are not finite at params0, and not declared missing; that are (n, n), because (n, 1) and (n,)
-            were subtracted; that do not depend on any parameter there; or that JAX cannot trace; more parameters than
-            residuals.
+        TypeError, ValueError: an argument of a wrong kind; an initial guess that a transform excludes; no free
+            parameter; more parameters than residuals. Also residuals that are not finite at params0 and not declared
+            missing; that are (n, n), because (n, 1) and (n,) were subtracted; that do not depend on any parameter at
+            params0; or that JAX cannot trace.
 
     Warns:
-        IdentifiabilityWarning: the Jacobian at the solution lacks rank: names the parameters concerned, and the
-            combination of them that does not matter.
+        IdentifiabilityWarning: the Jacobian at the solution is rank deficient. The warning names the parameters, and
+            the combination of them that has no effect.
 
     References:
         Levenberg (1944); Marquardt (1963), with his scaling of the damping; Nocedal, Wright (2006), Ch. 10; geodesic
@@ -172,7 +179,7 @@ def _many(options: Options, of_records: bool, alone: bool, executor: Any, mesh: 
         raise ValueError("fit: give an `executor` or a `mesh`, not both.")
     if not of_records or options.optimizer != LEVENBERG_MARQUARDT:
         raise ValueError(
-            "fit: an `executor` or a `mesh` shares out `records`, for Levenberg-Marquardt; without `records` use "
+            "fit: an `executor` or a `mesh` needs `records` and Levenberg-Marquardt; without `records` use "
             "sweep(mesh=) in the residuals."
         )
     if not alone:
@@ -185,7 +192,7 @@ def _many(options: Options, of_records: bool, alone: bool, executor: Any, mesh: 
 
 
 def _solved(solver, residuals: Callable, options: Options, params0: PyTree, data: PyTree) -> FitResult:
-    """The fit by a solver, with arrays that the residuals read as data, where another fit has read others before."""
+    """Runs a solver. Arrays that the residuals read are inputs of its program if an earlier fit has read other ones."""
     found = None if is_tracing() or data.records is not None else with_data(residuals)
     if found is not None:
         kind, arrays = found
@@ -198,10 +205,10 @@ def _solved(solver, residuals: Callable, options: Options, params0: PyTree, data
 
 @shown
 class Multistart(NamedTuple):
-    """What `multistart` found.
+    """Result of `multistart`.
 
     Attributes:
-        best: the `FitResult` of the lowest cost.
+        best: the `FitResult` with the lowest cost.
         all: a `FitResult` with a leading axis, one entry for each start.
     """
 
@@ -226,21 +233,22 @@ def multistart(
     executor: Executor | None = None,
     chunk: int = 1,
 ) -> Multistart:
-    """`fit` from several starts at once, vectorised, or by the workers of an executor.
+    """Runs `fit` from several initial guesses at once: vectorised, or on the workers of an executor.
 
     Args:
-        starts: a pytree like params0, each leaf with a leading axis, one entry for each start.
-        scale: a pytree like params0; by default that of the first start.
+        starts: a pytree like params0. Each leaf has a leading axis, with one entry for each initial guess.
+        scale: a pytree like params0. Default: the default scale of the first start.
         residuals, optimizer, transforms, weights, loss, prior, max_iterations, tolerance, covariance, segments: as in
             `fit`.
-        executor: whose workers fit, as for `parallel_map`; the call has to stand outside jit.
-        chunk: with an executor, starts in a task. Those of a chunk are iterated as long as the last of them needs.
+        executor: its workers run the fits, as for `parallel_map`. The call must be outside jit.
+        chunk: number of starts in each task of the executor. All starts of a task iterate until the slowest has ended.
 
     Returns:
         A `Multistart`.
 
     Raises:
-        TypeError, ValueError: as `fit`; starts of unequal numbers; residuals that are finite at none of them.
+        TypeError, ValueError: as `fit`; leaves of `starts` with different leading lengths; residuals that are not
+            finite at any start.
         NotImplementedError, RuntimeError: of an executor, as `parallel_map`.
 
     >>> import jax.numpy as jnp, hhtjax
@@ -304,7 +312,7 @@ def _check_data(caller: str, params0: PyTree, scale, weights: PyTree, prior: dic
 
 
 def _finished(caller: str, result: FitResult, weights: PyTree) -> FitResult:
-    """The result of a fit outside of jit: trouble told, and the history cut to what happened."""
+    """The result of a fit outside jit: raises or warns about problems, and cuts the history to the iterations made."""
     code = int(result.code)
     if code == BAD_START:
         bad = first_bad(result.residual, weights, result.starts is not None)

@@ -1,4 +1,4 @@
-"""Questions to a fit: which term is missing, how far one parameter can go, how sure a prediction is."""
+"""Further analysis of a fit: missing terms, profile likelihoods, errors of predictions."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ if TYPE_CHECKING:
 
 @shown
 class Score(NamedTuple):
-    """What `score_test` says of each candidate, arrays (candidates,).
+    """Result of `score_test`: arrays (candidates,).
 
     Attributes:
-        names: of the candidates.
-        statistic: about chi-squared with one degree of freedom where the term is absent, so that 3.84 is the 95 % and
-            10.8 the 99.9 % point.
-        cost_drop: share of the cost that it would take away.
-        estimate: one Gauss-Newton step.
+        names: names of the candidates.
+        statistic: about chi-squared with one degree of freedom if the term is absent in reality, so that 3.84 is the
+            95 % and 10.8 the 99.9 % point.
+        cost_drop: share of the cost that the term would remove.
+        estimate: estimate of the candidate, by one Gauss-Newton step.
 
-    All are 0 for a term that the fitted parameters make up for, and where no residual is left.
+    All are 0 for a term whose effect the fitted parameters can reproduce, and if the residual is zero.
     """
 
     names: list
@@ -50,25 +50,26 @@ class Score(NamedTuple):
 def score_test(
     residuals: Callable[[Any, Any], Any], params: PyTree, candidates: Any, segments: int = SEGMENTS
 ) -> Score:
-    """Which further terms a model needs, from one Jacobian and without fitting any of them.
+    """Tests which additional terms a model needs, from one Jacobian, without fitting the terms.
 
-    With x a candidate's column of the Jacobian, less its projection on the columns of the fitted parameters,
+    Let x be a candidate's column of the Jacobian, minus its projection on the columns of the fitted parameters. Then
 
         statistic = (x^T r)^2 / sum_g (x_g^T r_g)^2,    cost_drop = (x^T r)^2/(|x|^2 |r|^2),    estimate = -x^T r/|x|^2
 
-    with the sum over segments g of the residual, as in the cluster covariance: correlated residuals are allowed for.
+    The sum is over segments g of the residual, as in the cluster covariance. So it allows for correlated residuals.
 
     Args:
         residuals: (params, candidates) -> a pytree of arrays.
-        params: as fitted without the candidates. candidates: the values at which they are absent, mostly zeros.
-        segments: how many.
+        params: parameters fitted without the candidates. candidates: the values at which the terms are absent, usually
+            zeros.
+        segments: number of segments.
 
     Returns:
         A `Score`.
 
     Raises:
-        TypeError, ValueError: residuals is no function of two; params is a `FitResult`; segments is no integer, 2 or
-            more.
+        TypeError, ValueError: residuals is not a function of two arguments; params is a `FitResult`; segments is not an
+            integer of 2 or more.
 
     References:
         Rao (1948); with sandwich variance, Boos, Am. Stat. 46 (1992).
@@ -84,7 +85,7 @@ def score_test(
     """
     require_function("score_test", "residuals", residuals, "residuals(params, candidates)")
     if isinstance(params, FitResult):
-        raise TypeError("score_test: `params` must be those of a fit, result.params; received the FitResult.")
+        raise TypeError("score_test: `params` must be the parameters of a fit, result.params; received a FitResult.")
     segments = require_integer("score_test", "segments", segments, 2)
     params, candidates = (
         jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), freeze(y)) for y in (params, candidates)
@@ -111,13 +112,13 @@ def score_test(
 
 @shown
 class Profile(NamedTuple):
-    """What `profile` found.
+    """Result of `profile`.
 
     Attributes:
-        values: of the parameter, (values,).
-        cost: the least one with the parameter held there, (values,).
-        deviance: 2 (cost - that of the fit)/variance, (values,), scaled so that its parabola is that of the standard
-            error; 3.84 bounds the 95 % interval. NaN for a parameter without one.
+        values: values of the parameter, (values,).
+        cost: the lowest cost with the parameter held at each value, (values,).
+        deviance: 2 (cost - cost of the fit)/variance, (values,). The variance is chosen so that near the estimate this
+            is the parabola of the standard error; 3.84 bounds the 95 % interval. NaN if the standard error is infinite.
     """
 
     values: PyTree
@@ -126,19 +127,19 @@ class Profile(NamedTuple):
 
 
 def profile(residuals: Callable[..., Any], result: FitResult, name: str, values: Real, **options: Any) -> Profile:
-    """The profile likelihood of one parameter: the cost with it held at each value, and all others refitted.
+    """The profile likelihood of one parameter: it is held at each value, and all others are fitted again.
 
     Args:
-        residuals, options: as they were given to `fit`, the transforms excepted.
-        result: of that fit, with its covariance.
-        name: of a scalar parameter, as in `result.summary()`. values: where to hold it.
+        residuals, options: as they were given to `fit`, except the transforms.
+        result: the `FitResult`, with its covariance.
+        name: name of a scalar parameter, as in `result.summary()`. values: values at which it is held.
 
     Returns:
         A `Profile`.
 
     Raises:
-        TypeError, ValueError: result is none of `fit`, or without covariance; no parameter of that name, or one that is
-            no scalar leaf or was fixed.
+        TypeError, ValueError: result is not a `FitResult`, or has no covariance; no parameter has that name, or it is
+            not a scalar leaf, or it was fixed.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> x = jnp.linspace(0.0, 1.0, 200)
@@ -190,19 +191,19 @@ def _flags(leaves: list, at: int) -> np.ndarray:
 
 
 def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: float = 0.0) -> Any:
-    """Standard errors of `predict(params)`, a pytree like it: root of diag(J C J^T) + noise^2.
+    """Standard errors of `predict(params)`: sqrt(diag(J C J^T) + noise^2), with J the Jacobian of predict.
 
     Args:
-        predict: params -> any pytree of real arrays, such as the output at another input.
-        result: of `fit`, with its covariance C.
-        noise: standard deviation of a new measurement's noise.
+        predict: params -> any pytree of real arrays, such as the output for another input.
+        result: a `FitResult` with its covariance C.
+        noise: standard deviation of the noise of a new measurement.
 
     Returns:
-        Numbers and arrays like what predict returns; inf where a parameter matters that the fit left undetermined.
+        A pytree like the one that predict returns; inf where it depends on a parameter that the fit did not determine.
 
     Raises:
-        TypeError, ValueError: predict is no function; result is none of `fit`, or without covariance; a noise less than
-            0.
+        TypeError, ValueError: predict is not a function; result is not a `FitResult`, or has no covariance; a negative
+            noise.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> t = jnp.arange(100.0)
@@ -224,11 +225,11 @@ def prediction_errors(predict: Callable[[Any], Any], result: FitResult, noise: f
 
 
 # ----------------------------------------------------------------------------
-# Fits with one segment of the residuals left out after the other, and their errors there.
+# Cross-validation: fits without one segment of the residuals, and their errors on that segment.
 
 
 def _segment(shape: tuple, folds: int, fold: int) -> np.ndarray:
-    """Which entries of a leaf of the residuals are in one of its `folds` segments."""
+    """Which entries of a leaf of the residuals are in one of its `folds` segments, as Booleans."""
     order = in_time([shape])
     inside = np.zeros(order.size, bool)
     inside[order] = np.arange(order.size) // -(-order.size // folds) == fold
@@ -236,8 +237,11 @@ def _segment(shape: tuple, folds: int, fold: int) -> np.ndarray:
 
 
 def require_residuals_of(name: str, result: FitResult, function: Callable):
-    """An error unless the function gives a fit's residuals again, but for a small part of them, or for what a change
-    of the parameters by some 1e-8 does."""
+    """Raises an error unless the function reproduces the residuals of a fit.
+
+    A difference of a tenth of their norm is allowed, plus the change that relative changes of the parameters by some
+    1e-8 make.
+    """
     x, unravel = ravel_pytree(freeze(result.params))
     near = x * (1 + result.free * float(jnp.finfo(x.dtype).eps) ** 0.5)
     again, moved = (function(thaw(unravel(y))) for y in (x, near))
@@ -250,27 +254,27 @@ def require_residuals_of(name: str, result: FitResult, function: Callable):
     if not np.linalg.norm(again - own) <= size / 10 + reach:
         raise ValueError(
             f"compare: `residuals` of {name!r} must be those fitted, whose norm is {size:.6g} at the estimate; "
-            f"received others, of {np.linalg.norm(again):.6g}."
+            f"received others, with norm {np.linalg.norm(again):.6g}."
         )
 
 
 def leave_out(fits: dict, functions: dict, folds: int, always: np.ndarray, options: dict, progress: bool):
-    """For each fit, and each segment, what `_leave_out` says: two arrays."""
+    """The two results of `_leave_out` for each fit and each segment, as arrays."""
     left = [_leave_out(name, fits[name], functions[name], folds, always, options, progress) for name in fits]
     segments = sorted({len(errors) for errors, _ in left})
     if len(segments) > 1 or segments[0] < 2:
         raise ValueError(
-            "compare: `folds` must leave two segments or more with residuals to judge by, as many in all fits; "
-            f"received {folds}, which leaves {', '.join(map(str, segments))}."
+            "compare: `folds` must give two or more segments with residuals to evaluate, the same number in all fits; "
+            f"received {folds}, which gives {', '.join(map(str, segments))}."
         )
     errors, converged = zip(*left, strict=True)
     return np.array(errors), np.array(converged)
 
 
 def _leave_out(name: str, result: FitResult, function: Callable, folds: int, always, options: dict, progress: bool):
-    """rms of each segment by the parameters fitted to the others, and whether these fits converged.
+    """rms of each segment with the parameters fitted to the others, and whether these fits converged.
 
-    A segment without a residual to judge by is none: few residuals make fewer segments than `folds`.
+    A segment without a residual to evaluate does not count. So few residuals give fewer segments than `folds`.
     """
     weights = spread_weights("compare", result.weights, result.residual)
     always = spread_weights("compare", False if always is None else always, result.residual, "always")

@@ -1,4 +1,4 @@
-"""Where a fit starts: parameters from the equation of motion itself, and longer and longer parts of a record."""
+"""Initial guesses for a fit: from the equations of motion, and from fits to longer and longer parts of a record."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from hhtjax.systems.system import (
 )
 
 ARGUMENTS = set(inspect.signature(fit).parameters) - {"params0"}
-SLOW = 0.02  # part of the largest sliding velocity, below which a place may stick for all that a record tells
+SLOW = 0.02  # part of the largest sliding velocity, below which a place is taken as possibly sticking
 NOISE = 3.0  # standard deviations of the noise of a sliding velocity, below which it may stick, too
 MARGIN = 1.0  # periods of the cutoff left out at both ends
 
@@ -42,36 +42,38 @@ def equation_error(
     *,
     times: Real | None = None,
 ) -> Callable[[Any], Any]:
-    """The function params -> M(q) a - Q(q, v, t, params), for a measured motion q: residuals for `fit`.
+    """Residuals of the equations of motion for a measured motion q: the function params -> M(q) a - Q(q, v, t, params).
 
-    Of a `FirstOrderSystem` y' - f(y, t, params), for a measured y.
+    Pass this function to `fit`. It simulates nothing: velocities v and accelerations a come from the filtered
+    measurement. Most parameters enter linearly, so the fit converges from almost any guess. Use its estimate as the
+    initial guess of a fit through the simulation. Noise and the filter bias it, so it is not a final result.
 
-    With dry friction it holds H^T F sign(s) too. Where something may stick its friction is not known, and the rows that
-    it enters are left out: they count as no samples. It may stick where it slides slower than a fiftieth of its largest
-    velocity, or than three standard deviations of the noise of its velocity. That noise is taken to be white, as large
-    as what the values hold above the cutoff.
+    For a `FirstOrderSystem` the function is params -> y' - f(y, t, params), with a measured y.
 
-    Nothing is simulated, and most parameters enter linearly: so the fit converges from anywhere, and its estimate is a
-    start for the fit through the simulation. It is no more than that, because noise and filter bias it.
+    With dry friction the residual includes H^T F sign(s). The friction force of a joint that may stick is unknown, so
+    the rows in which it appears are left out. A joint counts as possibly sticking if it slides slower than a fiftieth
+    of its largest velocity, or slower than three standard deviations of the noise of its velocity. This noise is
+    assumed to be white; its size is estimated from the part of the values above the cutoff.
 
     Args:
-        system: without constraints and rotations, all of whose coordinates are measured.
+        system: a system without constraints and rotations. All its coordinates must be measured.
         values: positions, a pytree like q with a leading axis of samples. dt: sampling period, s.
         cutoff: Hz, between the frequencies of the motion and those of the noise.
         t0: time of the first sample.
-        times: (samples,), in the place of dt and t0: sample times at any distances. The values are then those of the
-            cubic spline through them, `sampled(values, times=)`, as many as the samples, at equal distances: the cutoff
-            has to stay well below half the sampling rate of the sparsest part.
+        times: (samples,), sample times at any distances, instead of dt and t0. The values are then resampled at equal
+            distances, as many as the samples, from the cubic spline `sampled(values, times=)`. The cutoff must stay
+            well below half the sampling rate of the sparsest part.
 
     Returns:
-        A function of params, whose result is (samples without both ends, n), in units of force. With dry friction it is
-        a list of n arrays, the rows of each coordinate that are left. Where `sliding` reads params, or the values are
-        traced, which rows these are is not known before: they are 0 then, and count.
+        A function of params with values (samples without both ends, n), in units of force. With dry friction it returns
+        a list of n arrays, the remaining rows of each coordinate. If `sliding` reads params, or the values are traced,
+        these rows are not known in advance. The rows left out are then 0, and count as samples.
 
     Raises:
-        TypeError, ValueError: what is no system; as `band_limited_motion` and `sampled`; no samples between the ends;
-            nothing that slides.
-        NotImplementedError: a system with constraints, internal states or contact; when called, with rotations.
+        TypeError, ValueError: not a system; as `band_limited_motion` and `sampled`; no samples left between the ends;
+            dry friction, and no joint that slides.
+        NotImplementedError: a system with constraints, internal states or contact; rotations, when the returned
+            function is called.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q - params["c"] * v)
@@ -130,10 +132,11 @@ def _with_friction(flat, left: Array, q: Array, v: Array, t: Array, params: PyTr
 
 
 def _noise_of_rates(values: PyTree, smooth: PyTree, cutoff: float) -> Array:
-    """Standard deviation of the noise of rates below the cutoff, by what is above, times the sampling period: (n,).
+    """Standard deviation of the noise of filtered rates, times the sampling period: (n,).
 
-    cutoff: in cycles a sample. White noise sigma has the part sqrt(1 - 2 cutoff) of it above the cutoff, and gives a
-    rate of 2 pi cutoff sqrt(2 cutoff/3) sigma below it.
+    cutoff: in cycles per sample. The noise is estimated from the values above the cutoff. White noise sigma has the
+    part sqrt(1 - 2 cutoff) sigma above the cutoff. The rates of the part below it have 2 pi cutoff sqrt(2 cutoff/3)
+    sigma.
     """
 
     def rms(y: Real, smooth: Array) -> Array:
@@ -145,7 +148,7 @@ def _noise_of_rates(values: PyTree, smooth: PyTree, cutoff: float) -> Array:
 
 
 class _NotKnown:
-    """In the place of params: an error where they are read."""
+    """Placeholder for params that raises an error when it is read."""
 
     def __getattr__(self, name: str):
         raise TypeError("the params are not known yet")
@@ -154,7 +157,7 @@ class _NotKnown:
 
 
 def _rows_that_slide(system, motion: tuple, noise: Real) -> list | None:
-    """Numbers of the samples of each row into which nothing enters that may stick; None where params decide that."""
+    """For each row, the indices of samples at which no joint of it may stick; None if this depends on params."""
     if not all(map(is_concrete, jax.tree.leaves((motion, noise)))):
         return None
     try:
@@ -162,12 +165,12 @@ def _rows_that_slide(system, motion: tuple, noise: Real) -> list | None:
     except Exception:  # whatever a user's function does with params that are none; it is called again with some
         return None
     if not slides.any():
-        raise ValueError("equation_error: `values` must slide somewhere where `system` has dry friction; nothing does.")
+        raise ValueError("equation_error: in `values` some joint with dry friction must slide; none does.")
     return [np.flatnonzero(column) for column in slides.T]
 
 
 def _slides(system, motion: tuple, noise: Real, params: PyTree) -> Array:
-    """Whether nothing that enters a row is so slow that it may stick: (samples, n)."""
+    """(samples, n): whether no joint that enters the row is so slow that it may stick."""
     q, v, _, t = motion
 
     def one(q: PyTree, v: PyTree, t: Array):
@@ -185,20 +188,19 @@ def _slides(system, motion: tuple, noise: Real, params: PyTree) -> Array:
 
 
 def _require_no_rotations(system, q: PyTree, t: Array, params: PyTree):
-    """An error for positions (3, 3) whose mass is that of angular velocities (3,)."""
+    """Raises an error for positions (3, 3) that are rotations: the mass is then that of angular velocities (3,)."""
     turning = sum(x.size for x in jax.tree.leaves(q) if x.shape[-2:] == (3, 3))
     if turning and isinstance(system, System):
         M = evaluate("equation_error", "mass", partial(mass_at, system), q, t, params)
         rows = sum(x.size for x in jax.tree.leaves(q)) - turning + turning // 3
         if getattr(M, "shape", None) in ((rows,), (rows, rows)):
             raise NotImplementedError(
-                "equation_error: `system` has rotations, whose angular velocities are no derivatives of what `values` "
-                "holds."
+                "equation_error: `system` has rotations, whose angular velocities are not derivatives of `values`."
             )
 
 
 def _at_equal_distances(values: np.ndarray, dt: Real, t0: Real, times: np.ndarray):
-    """The values at as many times at equal distances, their sampling period, and the time of the first."""
+    """The values resampled at as many equally spaced times, the sampling period, and the time of the first."""
     splines = jax.tree.map(lambda y: sampled(y, dt, t0, times=times), values)
     t0, end, count = float(times[0]), float(times[-1]), len(times)
     dt = (end - t0) / (count - 1)
@@ -212,23 +214,24 @@ def _is_spline(x: Sampled) -> bool:
 def fit_progressively(
     problem_at: Callable[[Any, FitResult | None], dict[str, Any]], params0: PyTree, horizons: Any, **options: Any
 ) -> FitResult:
-    """One `fit` after the other, each to a longer part of the data, and each from where the one before ended.
+    """Fits longer and longer parts of the data. Each fit starts at the estimate of the previous one.
 
-    Over a short part a motion depends on its parameters almost linearly; over a long or chaotic one the cost has many
-    minima, and only the lowest is right. The early fits are cheap too.
+    Over a short time a motion depends almost linearly on its parameters. Over a long or chaotic one the cost has many
+    minima, and only the lowest is right. The early fits are also cheap.
 
     Args:
-        problem_at: (horizon, before) -> the arguments of `fit` for it, a dict with "residuals" and perhaps "records",
-            "starts", "weights". before: the `FitResult` of the last horizon, None for the first. With `windows` of that
-            duration it is multiple shooting.
-        params0: as in `fit`. horizons: a sequence of what problem_at takes, the shortest first.
-        options: of every fit, where problem_at says nothing else. Only the last one computes a covariance.
+        problem_at: (horizon, before) -> the arguments of `fit` for this horizon, a dict with "residuals" and optionally
+            "records", "starts", "weights". before: the `FitResult` of the previous horizon, None for the first. With
+            `windows` of that duration this is multiple shooting.
+        params0: as in `fit`. horizons: a sequence of values for problem_at, the shortest first.
+        options: options of every fit, unless problem_at returns them. Only the last fit computes a covariance.
 
     Returns:
         The last `FitResult`.
 
     Raises:
-        TypeError, ValueError: problem_at is no function of two, or what it returns no arguments of `fit`; no horizon.
+        TypeError, ValueError: problem_at is not a function of two arguments, or does not return arguments of `fit`; no
+            horizon.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> t = jnp.linspace(0.0, 30.0, 600)
@@ -256,12 +259,12 @@ def fit_progressively(
 
 
 def _problem(found: PyTree, horizon: int):
-    """What problem_at returned, if `fit` can take it."""
+    """The arguments that problem_at returned, checked."""
     where = f"fit_progressively: `problem_at` must return a dict of arguments of `fit`; received at horizon {horizon!r}"
     if not isinstance(found, dict):
         raise TypeError(f"{where} a {type(found).__name__}.")
     if wrong := [name for name in found if name not in ARGUMENTS]:
-        raise ValueError(f"{where} {wrong[0]!r}, which is none.")
+        raise ValueError(f"{where} {wrong[0]!r}, which is not an argument of `fit`.")
     if "residuals" not in found:
         raise ValueError(f"{where} {', '.join(found) or 'an empty one'}, without residuals.")
     return found

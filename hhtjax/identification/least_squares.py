@@ -1,6 +1,6 @@
 """Levenberg-Marquardt on vectors: a loop of JAX, which runs under jit and vmap, or of NumPy, which does not compile.
 
-What ended it is a code.
+The reason for which it ended is returned as a code, whose text is in REASONS.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from hhtjax.numerics.array_namespace import namespace_of, select, while_loop, wi
 if TYPE_CHECKING:
     from hhtjax.identification.gauss_newton import Dense, DenseTrial
 
-ALIKE = 0.7  # cosine of two steps, from which on one tells how the residual bends along the other
-MOST_BENT = 1.5  # 2 |D a| over |D v|: beyond it v is no straight line any more, and a no correction of it
+ALIKE = 0.7  # least cosine of two steps at which the curvature along one is used for the other
+MOST_BENT = 1.5  # largest 2 |D a|/|D v|: beyond it a is too large to be a correction of v
 LESS, AGAIN, FASTER = 2.0, 4.0, 6  # lam is divided by 2 after a good step, by 4 times more after each further one
 
 
 class Course(NamedTuple):
-    """What is known from the steps so far."""
+    """Damping and curvature, as learnt from the steps so far."""
 
     lam: Array
     radius: Array  # |D dx| of the next step at most; inf after a success
@@ -53,16 +53,16 @@ def levenberg_marquardt(
 
     dx = v + a/2,    v = -(J^T J + lam D^2)^-1 J^T r,    a = -(J^T J + lam D^2)^-1 J^T r''
 
-    with the velocity v and the acceleration a of a path that follows a curved valley (Transtrum, Sethna 2012). r'' is
-    the second derivative of the residual along v. It is not evaluated: the difference of the Jacobians at the ends of
-    the last step gives it along that step, and the part of v along it is taken. So it costs no run, and needs no second
-    derivative of what runs.
+    v and a are the velocity and the acceleration of a path that follows a curved valley (Transtrum, Sethna 2012). r''
+    is the second derivative of the residual along v. It is estimated from the difference of the Jacobians at the ends
+    of the last step, using the part of v along that step. So it needs no further run and no second derivative.
 
-    With rho the decrease of the cost over that predicted, lam changes by the factor max(least, 1 - (2 rho - 1)^3) when
-    a step lowers the cost (Nielsen 1999); least is 1/2, and less by 4 with each step of rho > 0.9 that follows another.
-    When it does not, lam grows until |D v| is half as long, or a quarter after two failures, an eighth after three, ...
-    It also grows until no entry of v is longer than that of `longest`. room: for how many iterations the history has
-    room, where max_iterations is a tracer. enough: trial, step -> whether to end with a step like that, for STEP.
+    Let rho be the decrease of the cost divided by the predicted one. When a step lowers the cost, lam is multiplied by
+    max(least, 1 - (2 rho - 1)^3) (Nielsen 1999). least is 1/2; it is divided by 4 for each further step in a row with
+    rho > 0.9. When a step does not lower the cost, lam grows until |D v| is half as long, or a quarter after two
+    failures, an eighth after three, ... lam also grows until no entry of v is longer than that of `longest`.
+
+    room: length of the history if max_iterations is a tracer. enough: (trial, step) -> whether to end, with code STEP.
     """
     xp, eps = namespace_of(x), float(jnp.finfo(x.dtype).eps)
     running = xp.asarray(RUNNING, np.int32)
@@ -107,7 +107,7 @@ def levenberg_marquardt(
 
 
 def _half_acceleration(problem, now: DenseTrial, course: Course, attempt: tuple, longest: np.ndarray) -> np.ndarray:
-    """a/2 of the step v; 0 where v is not along the step that tells of r'', or a not small against v."""
+    """a/2 of the step v; 0 if v is not nearly along the last step, of which r'' is known, or if a is not small."""
     xp, (lam, v) = namespace_of(now.x), attempt
     own, last = now.D * v, now.D * course.along
     size, both = xp.linalg.norm(last), xp.sum(own * last)
@@ -119,7 +119,7 @@ def _half_acceleration(problem, now: DenseTrial, course: Course, attempt: tuple,
 
 
 def _learn(problem, trials: tuple, course: Course, attempt: tuple, rho: Real, lower: Real) -> Course:
-    """The `Course` behind an attempt."""
+    """The `Course` after an attempt."""
     (now, new, best), (lam, v, step) = trials, attempt
     xp, eps = namespace_of(now.x), float(jnp.finfo(now.x.dtype).eps)
     good = xp.where(lower & (rho > 0.9), xp.minimum(course.good + 1, FASTER), 0)
@@ -137,12 +137,12 @@ def _learn(problem, trials: tuple, course: Course, attempt: tuple, rho: Real, lo
 
 
 def _small(problem, now: DenseTrial, new, lower: Real, attempt: tuple, start: Real, tolerance: Real) -> np.ndarray:
-    """COST or STEP where an attempt has changed the cost or the unknowns too little to go on; else RUNNING. GRADIENT
-    where the residual is rounding.
+    """The code COST or STEP if an attempt has changed the cost or the unknowns too little to go on, otherwise RUNNING.
 
-    A step is also small, and changes little, because it is damped, or because a derivative is 1e10, as of a chaotic
-    run: the gradient has to be small too, or the residual next to nothing; and the damping has to be small, or the
-    part of the residual that a step without damping would take away (the relative offset of Bates, Watts 1981).
+    GRADIENT if the residual is only rounding. A step can also be small because it is damped, or because a derivative is
+    huge (1e10), as of a chaotic run. So two more conditions must hold. First, the gradient or the residual is small.
+    Second, the damping is small, or so is the part of the residual that an undamped step would remove (the relative
+    offset of Bates, Watts 1981).
     """
     xp, (step, predicted, lam) = namespace_of(now.x), attempt
     flat = (predicted <= tolerance * now.cost) & (xp.abs(now.cost - new.cost) <= tolerance * now.cost)
@@ -160,8 +160,10 @@ def _small(problem, now: DenseTrial, new, lower: Real, attempt: tuple, start: Re
 
 
 def _within(problem, now: DenseTrial, course: Course, longest: np.ndarray):
-    """The least damping, lam times a power of 2, whose step is within `longest` and the radius; that step, and what it
-    predicts."""
+    """(lam, step, predicted decrease): the least damping, lam times a power of 2, whose step is not too long.
+
+    A step is too long if it exceeds `longest` or the radius.
+    """
     xp = namespace_of(now.x)
     longest = _bounded(longest, now.x.dtype)
 
@@ -177,17 +179,18 @@ def _within(problem, now: DenseTrial, course: Course, longest: np.ndarray):
 
 
 def _bounded(longest: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """The longest steps, so that inf is too long."""
+    """`longest` with finite numbers instead of inf, so that an infinite step counts as too long."""
     return np.minimum(longest, np.finfo(dtype).max).astype(dtype)
 
 
 # ----------------------------------------------------------------------------
-# Fits whose residuals simulate under error control: steps are frozen, and chosen again, until the estimates stay.
+# Fits whose residuals simulate under error control: steps are frozen and chosen again until the estimates settle.
 #
-# Steps that are chosen anew for each trial make the cost jump by what tolerances leave, and Levenberg-Marquardt ends
-# where it jumps down by chance. So a first round, which does that, comes near, to steps of a small part of the standard
-# errors. Those after it keep the steps that are chosen where the round before has ended. These are for the motion
-# there, and wrong far away: a frozen round that moves the estimates by no more than such a part is the last.
+# Steps that are chosen anew at each trial make the cost jump by the errors that the tolerances allow. A fit would then
+# end where the cost jumps down by chance. So the first round, which chooses steps at each trial, ends when it moves the
+# estimates by a small part of the standard errors. Each later round keeps the steps that were chosen at the end of the
+# round before. They suit the motion there, and would be wrong far away. So the last round is the first one that moves
+# the estimates by no more than such a small part.
 
 
 MOST = 5  # rounds with frozen steps
@@ -197,9 +200,9 @@ SMALL = 0.1  # standard errors
 def in_rounds(
     problem_for: Callable, x: Array, longest: np.ndarray, tolerance: Array, max_iterations: int, progress: bool
 ):
-    """`levenberg_marquardt` in rounds; also how many had frozen steps.
+    """`levenberg_marquardt` in rounds; also returns the number of rounds with frozen steps.
 
-    problem_for: y, whether steps are chosen at each trial -> the problem, with steps as for y if they are not.
+    problem_for: (y, fresh) -> the problem. With `fresh` steps are chosen at each trial, otherwise they are those at y.
     """
 
     def unfinished(carry: tuple) -> Array:
@@ -234,7 +237,7 @@ def in_rounds(
 
 
 def joined(before: Array, fresh: Array, old: Array, new: Array) -> Array:
-    """The history of a round behind that of those before it, after so many iterations."""
+    """The history of a round appended to that of the earlier rounds, which had `before` iterations."""
     behind = jnp.arange(old.size, dtype=jnp.int32) > before
     return jnp.where(behind | fresh, jnp.roll(new, before), old)
 
@@ -244,13 +247,13 @@ def joined(before: Array, fresh: Array, old: Array, new: Array) -> Array:
 
 
 class Smooth(NamedTuple):
-    """A cost of residuals f(x) (m,), of which reverse mode gives the gradient."""
+    """A cost of residuals f(x) (m,), whose gradient is computed by reverse mode."""
 
     f: Callable
     objective: Objective
 
     def cost(self, x: Array) -> Array:
-        """Of all residuals."""
+        """The cost at x."""
         return self.objective.cost(self.f(x))
 
     def read(self, _):
@@ -265,7 +268,7 @@ class Smooth(NamedTuple):
 def descend(
     problem: Smooth, x: Array, optimizer, tolerance: Array, max_iterations: int, progress: bool, patience: int = 5
 ):
-    """An optax optimiser on the cost of a `Smooth` problem; returns the best point it saw."""
+    """Minimises the cost of a `Smooth` problem by an optax optimiser; returns the best point of all iterations."""
     import optax  # where a fit needs it: see `for_many`
 
     optimizer = optax.with_extra_args_support(optimizer)
@@ -302,7 +305,7 @@ def descend(
 
 
 # ----------------------------------------------------------------------------
-# How a fit went: why it ended, its history, and what it shows on the way.
+# The course of a fit: why it ended, its history, and the line of progress.
 
 
 RUNNING, COST, STEP, GRADIENT, LIMIT, STUCK, BAD_START, NO_INFLUENCE, UNSETTLED = range(9)
@@ -319,19 +322,19 @@ REASONS = {
     UNSETTLED: "stopped: the estimates change whenever steps are chosen anew; take a smaller rtol",
 }
 NO_SLOPE = (
-    "a finite residual with a derivative that is not finite: roots, norms and max(x, 0)**1.5 have none, or no second "
-    "one, at 0, where max(x, 1e-12) has"
+    "a finite residual whose derivative is not finite: at 0, roots and norms have no derivative, and max(x, 0)**1.5 "
+    "has no second derivative; use max(x, 1e-12) for x there"
 )
 
 
 @shown
 class History(NamedTuple):
-    """The course of a fit, per iteration, the start first.
+    """The course of a fit: one entry for each iteration, the first one for the initial guess.
 
     Attributes:
-        cost: after the iteration.
-        step: largest entry of the step in the scaled coordinates, 0 where it was taken back.
-        damping: of Levenberg-Marquardt (None for optax).
+        cost: cost after the iteration.
+        step: largest entry of the step in the scaled coordinates, 0 if the step was rejected.
+        damping: damping of Levenberg-Marquardt (None for optax).
     """
 
     cost: Any
@@ -340,7 +343,7 @@ class History(NamedTuple):
 
 
 def record(history: History, i: Real, *values):
-    """The history with the values of iteration i; None where there are none."""
+    """The history with the values of iteration i entered; fields that are None stay None."""
     return History(*(None if x is None else with_entry(x, i, y) for x, y in zip(history, values, strict=True)))
 
 

@@ -26,14 +26,14 @@ LEAST_BEND = 0.1  # share of rho' that rho' + 2 rho'' z is taken to have at leas
 
 
 class Objective(NamedTuple):
-    """1/2 sum rho(z) with z = (w r)^2 for the first `data` residuals, and rho(z) = z for the others, the priors."""
+    """The cost 1/2 sum rho(z), z = (w r)^2, of the first `data` residuals; for the others, the priors, rho(z) = z."""
 
     weights: PyTree  # (m,); 0: missing, whatever the residual
     loss: Callable | None
     data: int
 
     def scaled(self, r: Array) -> Array:
-        """w r, with 0 in the place of what is missing; r may be a Jacobian."""
+        """w r, with 0 where samples are missing; r may be a Jacobian."""
         w = self.weights.reshape(-1, *(1,) * (r.ndim - 1))
         return jnp.where(w == 0, 0, w * r)
 
@@ -58,8 +58,8 @@ class Objective(NamedTuple):
     def least_squares(self, r: Array, J: Array):
         """(r, J) of an ordinary least-squares problem with the same gradient J^T r.
 
-        The rows of J are scaled by sqrt(rho' + 2 rho'' z) (Triggs et al. 2000, Sec. 4.3), but not far below the
-        sqrt(rho') of iterative reweighting: so the length of r stays that of the gradient's own residual.
+        The rows of J are scaled by sqrt(rho' + 2 rho'' z) (Triggs et al. 2000, Sec. 4.3). This factor is kept from
+        falling far below sqrt(rho'), that of iterative reweighting, so that r does not become too long.
         """
         if self.loss is None:
             return self.scaled(r), self.scaled(J)
@@ -68,19 +68,22 @@ class Objective(NamedTuple):
         return slope * r / jnp.where(row == 0, 1, row), J * row[:, None]
 
     def stretch(self, r: Array):
-        """rho' + 2 rho'' z of each residual, and not far less than rho': the squares of the factors of the rows of w J.
-        None without a loss: 1."""
+        """Squares of the factors by which `least_squares` scales the rows of w J; None without a loss (all 1).
+
+        They are rho' + 2 rho'' z, kept from falling far below rho'.
+        """
         return None if self.loss is None else self._stretch(r)
 
     def _stretch(self, r: Array) -> Array:
-        """Of a cost with a loss."""
+        """`stretch` of a cost with a loss."""
         _, slope, curvature = self.losses(r)
         return jnp.maximum(slope + 2 * curvature * self.scaled(r) ** 2, LEAST_BEND * slope)
 
     def estimating(self, r: Array, J: Array):
-        """w J, and the first and second derivative of the loss of each weighted residual (None without a loss: 1).
+        """(J, pull, bend): w J, and the first and second derivative of the loss of each weighted residual.
 
-        With them J^T pull is the gradient of the cost, and J^T diag(bend) J its second derivative.
+        J^T pull is the gradient of the cost, and J^T diag(bend) J its second derivative. bend is None without a loss,
+        where it is 1.
         """
         r, J, (_, slope, curvature) = self.scaled(r), self.scaled(J), self.losses(r)
         return J, slope * r, None if self.loss is None else slope + 2 * curvature * r**2

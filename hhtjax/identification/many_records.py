@@ -1,8 +1,8 @@
-"""Records of a fit by the workers of an executor, or by the devices of a mesh.
+"""Evaluation of the records of a fit by the workers of an executor, or by the devices of a mesh.
 
-Levenberg-Marquardt needs of each record the triangle of [J r] = Q R, not its rows: so these stay where they are made,
-and k + p + 1 numbers a column come back, k being a record's own unknowns and p the shared ones. The rows are collected
-once, at the minimum, for the standard errors.
+Levenberg-Marquardt needs only the triangle R of [J r] = Q R of each record, not the rows of J and r. So the rows stay
+on the workers, and R is returned, a square matrix of k + p + 1 columns, where k is the number of the record's own
+unknowns and p that of the shared ones. The rows are collected once, at the minimum, for the standard errors.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Many(NamedTuple):
-    """Who evaluates records. chunk: in a task of an executor."""
+    """The workers or devices that evaluate records. chunk: number of records in a task of an executor."""
 
     hands: Hands | None
     mesh: Mesh | None
@@ -52,7 +52,7 @@ class Many(NamedTuple):
         return ManyRecords(triangles, rows, p, w.shape)
 
     def _evaluated(self, f: _Records, shared: list, of_records: list, count: int, p: int) -> Callable:
-        """x -> results for all records."""
+        """The function x -> results for all records."""
 
         def own_at(x: np.ndarray, members: np.ndarray) -> list:
             return [x[:p], x[p:].reshape(count, -1)[members], *(y[members] for y in of_records)]
@@ -77,7 +77,7 @@ class Many(NamedTuple):
 
 @dataclass(frozen=True)
 class _Records:
-    """What is known of some records at x, a function of lists of arrays: triangles, or rows."""
+    """Evaluates some records at x: their triangles, or with `rows` their residuals and Jacobians."""
 
     residuals: Callable | Reading
     options: Options
@@ -108,7 +108,10 @@ def triangles(seen: Seen) -> Array:
 
 
 class ManyRecords(NamedTuple):
-    """An `Arrow` problem whose records are evaluated elsewhere. triangles, read: x -> what is known of all of them."""
+    """An `Arrow` problem whose records are evaluated by workers or devices.
+
+    triangles: x -> triangles of all records. read: x -> their residuals and Jacobians.
+    """
 
     triangles: Callable
     read: Callable
@@ -117,7 +120,7 @@ class ManyRecords(NamedTuple):
 
     @property
     def count(self) -> int:
-        """Of records."""
+        """Number of records."""
         return self.shape[0]
 
     def look(self, x: np.ndarray, D: np.ndarray) -> ArrowTrial:
@@ -135,7 +138,7 @@ class ManyRecords(NamedTuple):
         return found["r"], found["J"], found["J_own"]
 
     def bending(self, now: ArrowTrial, new: ArrowTrial, at: ArrowTrial, step: np.ndarray) -> np.ndarray:
-        """0: steps are not bent, which would take the rows."""
+        """0: no geodesic acceleration, which would need the rows."""
         return 0 * step
 
     nothing = HostRecords.nothing
@@ -144,7 +147,7 @@ class ManyRecords(NamedTuple):
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _on_mesh(f: _Records, mesh: Mesh, shared: list, own: list) -> PyTree:
-    """f of all records, each device its part of them."""
+    """f of all records; each device evaluates its part."""
     x, *of_records = own
     spread, same = PartitionSpec(mesh.axis_names), PartitionSpec()
     parts = jax.shard_map(

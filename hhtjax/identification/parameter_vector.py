@@ -1,4 +1,4 @@
-"""What a fit is made of: a vector of coordinates, residuals as functions of it, and their weights."""
+"""The vector of coordinates that a fit moves, its residuals as functions of this vector, and their weights."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Data(NamedTuple):
     read: Any = None  # arrays that the residuals read, where these are a `Kind`
 
     def function(self, residuals: Callable | Reading) -> Callable | Reading:
-        """The residuals, with what they read."""
+        """The residuals, with the arrays that they read."""
         return residuals.of(self.read) if isinstance(residuals, Kind) else residuals
 
 
@@ -80,14 +80,20 @@ class Coordinates:
 
 
 def longest_steps(transforms: tuple, leaves: list, own: int = 0) -> np.ndarray:
-    """Of the vector x, within which a transform is about straight, (p + own,); own: how many unknowns of records."""
+    """The longest step of each entry of x over which a transform is nearly straight, (p + own,).
+
+    own: number of unknowns of the records, which have no transform.
+    """
     pairs = [(T, x) for T, x in zip(transforms, leaves, strict=True) if T is not tf.fixed]
     steps = [np.broadcast_to(T.longest_step, np.shape(x)).ravel() for T, x in pairs]
     return np.concatenate([*steps, np.full(own, np.inf)])
 
 
 class DenseParts(NamedTuple):
-    """Of a fit without records: residuals and priors f(x) (m + k,), their weights w, and the first m as a pytree."""
+    """A fit without records: residuals and priors f(x) (m + k,), and their weights w.
+
+    unravel: turns the first m, the residuals, into a pytree.
+    """
 
     f: Any
     w: PyTree
@@ -96,7 +102,7 @@ class DenseParts(NamedTuple):
 
     @property
     def m(self) -> int:
-        """How many are no priors."""
+        """Number of residuals, without priors."""
         return sum(map(math.prod, self.shapes))
 
 
@@ -123,8 +129,10 @@ def dense_parts(residuals: Callable | Reading, coordinates: Coordinates, data: P
 
 
 class RecordParts(NamedTuple):
-    """Of a fit of records: residuals f(x, own, record) (m,), weights w (records, m), unknowns own0 (records, k), and
-    both as pytrees."""
+    """A fit of records: residuals f(x, own, record) (m,), weights w (records, m), and own unknowns own0 (records, k).
+
+    unravel, unravel_start: turn residuals and own unknowns into pytrees.
+    """
 
     f: Any
     w: PyTree
@@ -137,8 +145,7 @@ class RecordParts(NamedTuple):
 def record_parts(
     residuals: Callable, coordinates: Coordinates, data: PyTree, at_least: int | None = None
 ) -> RecordParts:
-    """One residual function of each record, with a start of its own. at_least: how many residuals there have to be, by
-    default as many as unknowns."""
+    """The `RecordParts` of a fit. at_least: least number of residuals, by default the number of unknowns."""
     _, unravel_start = ravel_pytree(first(data.starts))
     own0 = jax.vmap(lambda start: ravel_pytree(start)[0])(data.starts)
 
@@ -164,5 +171,5 @@ def record_parts(
 
 
 def first(tree: PyTree) -> PyTree:
-    """Of its leading axis."""
+    """The first entry along the leading axis of each leaf."""
     return jax.tree.map(lambda x: x[0], tree)

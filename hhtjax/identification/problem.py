@@ -1,4 +1,4 @@
-"""A fit as one compiled program: from checked arguments to a `FitResult`."""
+"""A fit from checked arguments to a `FitResult`: as one compiled program, or with its small algebra in NumPy."""
 
 from __future__ import annotations
 
@@ -35,9 +35,11 @@ if TYPE_CHECKING:
 
 
 class _Solved(NamedTuple):
-    """x and what belongs to it. J, pull, bend: of `Objective.estimating` there, J None if not asked for; leaves: pull
-    as a pytree's leaves, of the given sizes; present: how many rows are not missing; block: how many stay in one
-    segment."""
+    """The solution x, and the residuals and Jacobian there.
+
+    J, pull, bend: from `Objective.estimating`; J is None without covariance. leaves: pull as leaves of a pytree, with
+    the given sizes. present: number of rows that are not missing. block: number of rows that stay in one segment.
+    """
 
     x: Any
     cost: Any
@@ -58,7 +60,7 @@ class _Solved(NamedTuple):
 
 @partial(Programs, static_argnums=(0, 1))
 def solve(residuals: Callable | Reading, options: Options, params0: PyTree, data: Data) -> FitResult:
-    """The fit, with what it says about itself as data."""
+    """The fit as one program. Its verdict is a code in the result; nothing is raised."""
     coordinates = Coordinates(options.transforms, params0, data.scale)
     limits = limits_of(options, data, coordinates.x0)
     branch = _solve_dense if data.records is None else _solve_records
@@ -74,7 +76,7 @@ def limits_of(options: Options, data: PyTree, x: Real):
 
 
 def result_of(options: Options, data: PyTree, found, params: PyTree, slope: Real) -> FitResult:
-    """What is known of a solution. slope: dp/dx of the fitted entries."""
+    """The `FitResult` of a solution. slope: dp/dx of the fitted entries."""
     believed, segments = None, 0
     if options.covariance:
         segments = count_segments(found.sizes, options.segments, found.block)
@@ -108,8 +110,11 @@ def _solve_dense(
 
 
 def dense_solution(x, cost, ended, residual, estimates, shapes, w) -> _Solved:
-    """ended: history, its length, the code, and how often steps were chosen; estimates: of `Objective.estimating`;
-    shapes: of the leaves of the residuals."""
+    """The `_Solved` of a fit without records.
+
+    ended: history, its length, the code, and how often steps were chosen. estimates: from `Objective.estimating`.
+    shapes: shapes of the leaves of the residuals.
+    """
     (J, pull, bend), (history, iterations, code, choices) = estimates, ended
     xp, sizes = namespace_of(w), [math.prod(shape) for shape in shapes]
     m = sum(sizes)
@@ -144,8 +149,11 @@ def _solve_records(residuals, options, coordinates, data: PyTree, limits):
 
 
 def records_solution(x, cost, ended, residual, starts, estimates, shapes, w, p, segments) -> _Solved:
-    """As `dense_solution`. estimates: of the derivatives by a record's own unknowns, and then by the p shared ones;
-    shapes: with the records in front."""
+    """The `_Solved` of a fit of records; arguments as for `dense_solution`.
+
+    estimates: with the columns of a record's own unknowns first, then those of the p shared ones. shapes: with the
+    records as first axis.
+    """
     (both, pull, bend), (history, iterations, code, choices) = estimates, ended
     xp, (count, whole) = namespace_of(w), w.shape
     k = both.shape[-1] - p
@@ -159,9 +167,10 @@ def records_solution(x, cost, ended, residual, starts, estimates, shapes, w, p, 
 
 
 def _minimise(problem, frozen: Callable | None, x0: Array, longest: np.ndarray, optimizer, limits: tuple):
-    """x, what the problem reads there, and the history, its length, the code, and how often steps were chosen.
+    """Minimises; returns x, the problem's `read` there, and (history, its length, code, how often steps were chosen).
 
-    frozen: y, fresh -> the problem with steps as for y, unless they are chosen anew; None where runs choose none.
+    frozen: (y, fresh) -> the problem with the steps that its runs take at y, or with `fresh` with steps chosen anew.
+    None if the runs do not choose steps.
     """
     if isinstance(problem, Smooth):
         x, *ended = descend(problem, x0, optimizer, *limits)
@@ -195,12 +204,12 @@ def _with_frozen_steps(problem, y, fresh):
 
 
 # ----------------------------------------------------------------------------
-# A fit outside of all transformations: residuals and Jacobians by a compiled program, all around them in NumPy.
+# A fit outside jit, vmap and grad: a compiled program evaluates residuals and Jacobians, NumPy does everything else.
 #
-# Levenberg-Marquardt and the covariances are a thousand small operations, which run once an iteration, and which XLA
-# would compile anew with every function of residuals: of a pendulum's fit that was two thirds of the time. They are the
-# lines of a fit inside a jit (`hhtjax.numerics.array_namespace`). Where runs choose their steps, and for many
-# residuals, the whole fit is one program, `solve`, as it is there.
+# Levenberg-Marquardt and the covariances are a thousand small operations. They run once an iteration, and XLA would
+# compile them again for every new function of residuals: in the fit of a pendulum this took two thirds of the time.
+# Both ways share the same code (`hhtjax.numerics.array_namespace`). If runs choose their steps, and for many residuals,
+# the whole fit is one program, `solve`, as inside jit.
 
 
 MANY = 100_000  # entries of a Jacobian; with more, memory that one program keeps saves more time than compiling takes
@@ -208,7 +217,7 @@ NUMBERS = "cost", "history", "iterations", "code", "uncertainty"  # of a `FitRes
 
 
 class Kept(NamedTuple):
-    """Of a point, for the result."""
+    """Values at a point that the `FitResult` needs."""
 
     estimates: Any  # of `Objective.estimating`; None where they are J, r, None
     residual: PyTree
@@ -221,7 +230,7 @@ class Kept(NamedTuple):
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Kind:
-    """What is known of a fit when it has been traced."""
+    """Static facts about a fit, known once it has been traced."""
 
     p: int  # unknowns, but those of records
     shapes: tuple  # of the leaves of the residuals
@@ -250,7 +259,7 @@ programs.add(_begin)
 def _see(
     residuals: Callable | Reading, options: Options, x: Array, params0: PyTree, data: PyTree, rows: tuple | None = None
 ) -> Seen:
-    """The `Seen` of x, with a `Kept`. rows: what `Arrow.read` returns there, where that is known."""
+    """The `Seen` of x, with a `Kept`. rows: the result of `Arrow.read` there, if it is known already."""
     coordinates = Coordinates(options.transforms, params0, data.scale)
     p, starts = coordinates.x0.size, None
     if data.records is None:
@@ -321,7 +330,7 @@ class HostRecords(NamedTuple):
 
 
 def _weighted(J: np.ndarray, kept: Kept):
-    """w J, whose rows in a least-squares problem are others where there is a loss."""
+    """w J, and the squared factors of its rows in the least-squares problem; None without a loss, where they are 1."""
     if kept is None or kept.estimates is None:
         return J, None
     wJ, _, _ = kept.estimates
@@ -329,13 +338,13 @@ def _weighted(J: np.ndarray, kept: Kept):
 
 
 def _in_numpy(seen: Seen) -> Seen:
-    """A `Seen` of NumPy arrays, but for what is kept beside r and J."""
+    """A `Seen` with NumPy arrays, except in its `Kept`."""
     seen, kept = jax.tree.map(np.asarray, seen._replace(read=None)), seen.read
     return seen._replace(read=(seen.r, seen.J, kept))
 
 
 def is_on_host(options: Options, *given: PyTree) -> bool:
-    """Whether a fit with these options, given these pytrees, can be done so."""
+    """Whether a fit with these options and inputs can run with NumPy: on the CPU, and outside jit, vmap and grad."""
     is_free = is_untouched() and not is_tracing() and all_concrete(given)
     return is_free and options.optimizer == LEVENBERG_MARQUARDT and jax.default_backend() == "cpu"
 
@@ -343,7 +352,7 @@ def is_on_host(options: Options, *given: PyTree) -> bool:
 def solve_on_host(
     residuals: Callable | Reading, options: Options, params0: PyTree, data: PyTree, many: Many | None = None
 ) -> FitResult:
-    """`solve`, where nothing is being traced. many: who evaluates records, this process if it is None."""
+    """`solve`, when nothing is being traced. many: the workers that evaluate records; None: this process."""
     x0, w, kind = _begin(residuals, options, params0, data)
     columns = x0.size if w.ndim == 1 else kind.p + (x0.size - kind.p) // len(w)
     if many is None and (kind.chooses_steps or w.size * columns > MANY):
@@ -374,7 +383,7 @@ def solve_on_host(
 
 
 def _require_equal_steps(kind: Kind):
-    """An error for residuals that choose their steps: they would have to be the same for all workers."""
+    """Raises an error for residuals that choose their steps: all workers would have to choose the same."""
     if kind.chooses_steps:
         raise NotImplementedError(
             "fit: with an `executor` or a `mesh`, residuals must not simulate under error control: take equal steps."
@@ -382,7 +391,7 @@ def _require_equal_steps(kind: Kind):
 
 
 def _solution(best, ended, kind, w, segments):
-    """What the best trial says, and its `Kept`."""
+    """The `_Solved` of the best trial, and its `Kept`."""
     r, J, kept = best.read
     estimates = kept.estimates
     if estimates is None:
@@ -408,9 +417,9 @@ def at_minimum(solve: Callable, problem_of: Callable, p: int, *data: PyTree):
     """solve(), with the derivatives of the minimum in `data`.
 
     Args:
-        solve: () -> x, what the problem's `read(x)` returns there, and more, which is constant to derivatives.
-        problem_of: the problem, as a function of the data.
-        p: how many unknowns are shared by all records; those that belong to one follow in x, record by record.
+        solve: () -> (x, the problem's `read(x)`, further results), where the last have zero derivatives.
+        problem_of: the problem as a function of the data.
+        p: number of unknowns shared by all records. Those of single records follow in x, record by record.
         data: pytrees of arrays.
     """
     call, closed_over = hoisted(solve)
@@ -431,7 +440,7 @@ def at_minimum(solve: Callable, problem_of: Callable, p: int, *data: PyTree):
 
 
 def _response(problem_of: Callable, p: int, x: Array, data: PyTree, moved: tuple) -> Array:
-    """dx where the data move so. Own unknowns are eliminated, and perturbed in all records at once."""
+    """dx for the tangent `moved` of the data. Unknowns of single records are eliminated; all are perturbed at once."""
     g, along = jax.jvp(lambda data: problem_of(*data).slopes(x), (data,), (moved,))
     count, size = g.shape
 
@@ -451,7 +460,7 @@ def _response(problem_of: Callable, p: int, x: Array, data: PyTree, moved: tuple
 
 
 def _inverse(H: Array) -> Array:
-    """Of a symmetric H whose unknowns differ in size; 0 in directions of which it says nothing."""
+    """Pseudoinverse of a symmetric H whose unknowns differ in size; 0 in directions in which H is singular."""
     D = jnp.sqrt(jnp.abs(jnp.diagonal(H)))
     D = jnp.where(D == 0, 1, D)
     sizes = jnp.outer(D, D)

@@ -1,4 +1,4 @@
-"""Fits with smaller and smaller steps, extrapolated: the estimate without the error of its step size."""
+"""Fits with smaller and smaller steps, and their extrapolation, which removes the error of the step size."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ UNDAMPED = 1e-6  # damping ratio, rounding of float32 included
 
 
 class StepSizeWarning(UserWarning):
-    """The step size shifts an estimate by more than its standard error, or by what cannot be taken out."""
+    """The step size shifts an estimate by more than its standard error, or by an amount that cannot be corrected."""
 
 
 @shown
 class Refined(NamedTuple):
-    """What `refine` returns: an estimate together with the scheme and the step that it belongs to.
+    """Result of `refine`: an extrapolated estimate, and the fits, stepper and step size that it was computed from.
 
     Attributes:
-        stepper, dt: of the first fit.
+        stepper, dt: stepper and step size of the first fit.
         fits: a `FitResult` for each of dt, dt/2, ...
-        params: Richardson's extrapolation to dt = 0.
-        shift: of the first fit from there, in its standard errors, a pytree like params.
+        params: the parameters extrapolated to dt = 0, by Richardson's method.
+        shift: (fits[0].params - params) in standard errors of the first fit, a pytree like params.
     """
 
     stepper: Stepper
@@ -51,20 +51,20 @@ class Refined(NamedTuple):
     shift: PyTree
 
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
-        """The interval of the last fit about `params`: two pytrees like them."""
+        """Confidence interval about `params`, with the standard errors of the last fit: two pytrees like params."""
         return self.fits[-1]._replace(params=self.params).interval(level)
 
     def to_json(self) -> str:
-        """All of it, scheme and step included, as JSON, for `Refined.from_json`.
+        """The whole result, with stepper and step size, as JSON text, to be read by `Refined.from_json`.
 
         Raises:
-            TypeError: a stepper with a `solve` of the user's, or with a traced coefficient.
+            TypeError: a stepper with a user-defined `solve`, or with a traced coefficient.
         """
         return json.dumps(report.encode(self))
 
     @staticmethod
     def from_json(text: str) -> Refined:
-        """What `to_json` wrote."""
+        """Reads a result from the text of `to_json`."""
         classes = Refined, Coefficients, Options, ExplicitTableau, RosenbrockTableau, *_subclasses(Stepper)
         return report.read(text, Refined, NAMED | {c.__name__: c for c in classes})
 
@@ -83,34 +83,35 @@ def refine(
     levels: int | None = None,
     **options: Any,
 ) -> Refined:
-    """Fits with dt, dt/2 and so on, and extrapolates the parameters to dt = 0.
+    """Fits with step sizes dt, dt/2 and so on, and extrapolates the parameters to dt = 0.
 
-    For a stepper of order p, with the errors h^p, h^(p + 1), ... taken out one by one:
+    For a stepper of order p the extrapolation removes the errors of order h^p, h^(p + 1), ... one by one:
 
-        levels = 2    fine + (fine - coarse)/(2^p - 1)
-        levels = 3    the same of two such pairs, with p + 1
+        levels = 2    R = fine + (fine - coarse)/(2^p - 1)
+        levels = 3    the same formula with p + 1, applied to the R of (dt, dt/2) and the R of (dt/2, dt/4)
 
-    A stepper that keeps the energy of an oscillation, like alpha = 0, has no error of h^(p + 1), and two levels do.
-    Numerical damping is such an error: three levels take it out too, for four more units of work.
+    A stepper that conserves the energy of an oscillation, like alpha = 0, has no error of order h^(p + 1). Two levels
+    are then enough. Numerical damping is an error of that order. Three levels remove it too; the third fit takes four
+    times as long as the first.
 
-    Parameters belong to the step size they were fitted with: for simulations with dt take `fits[0].params`, for what
-    they mean physically `params`.
+    Fitted parameters belong to the step size of their fit. To simulate with dt, use `fits[0].params`. For the physical
+    values, use `params`.
 
     Args:
         residuals_at: (stepper, dt) -> the function residuals(params) of `fit`.
-        params0, options: as in `fit`. Each fit starts where the one before ended.
-        stepper: whose order and damping decide about the extrapolation; handed to residuals_at.
+        params0, options: as in `fit`. Each fit starts at the estimate of the previous one.
+        stepper: passed to residuals_at. Its order and damping determine the extrapolation.
         dt: step size of the first fit, s.
-        levels: number of fits, at least 2. None: 3 with numerical damping, else 2.
+        levels: number of fits, at least 2. None: 3 with numerical damping, otherwise 2.
 
     Returns:
         A `Refined`.
 
     Warns:
-        StepSizeWarning: some parameter is shifted by more than one standard error: names it.
+        StepSizeWarning: the step size shifts a parameter by more than one standard error. The warning names it.
 
     Raises:
-        TypeError, ValueError: dt is no positive number, covariance=False, and whatever `fit` raises.
+        TypeError, ValueError: dt is not a positive number; covariance=False; and whatever `fit` raises.
 
     >>> import warnings, jax.numpy as jnp, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -params["k"] * q)
@@ -123,7 +124,7 @@ def refine(
     ...     return residuals
     >>> trapezoidal = hhtjax.hht(alpha=0.0, linearize="predictor")
     >>> with warnings.catch_warnings():
-    ...     warnings.simplefilter("ignore", hhtjax.identification.StepSizeWarning)      # there is no noise to hide it
+    ...     warnings.simplefilter("ignore", hhtjax.identification.StepSizeWarning)      # data without noise
     ...     found = hhtjax.refine(residuals_at, {"k": 8.9}, trapezoidal, 0.05)
     >>> f"{found.fits[0].params['k']:.2f} {found.params['k']:.4f}"
     '9.03 9.0000'
@@ -132,7 +133,9 @@ def refine(
     require_stepper("refine", stepper)
     require_number("refine", "dt", dt, lambda x: x > 0, "be positive")
     if not options.get("covariance", True):
-        raise ValueError("refine: leave out `covariance`: shifts are told in standard errors; received False.")
+        raise ValueError(
+            "refine: `covariance` must be True, because shifts are given in standard errors; received False."
+        )
     levels = needed_levels(stepper) if levels is None else require_integer("refine", "levels", levels, 2)
     fits = []
     for level in range(levels):
@@ -147,7 +150,7 @@ def refine(
 
 
 def needed_levels(stepper: Stepper) -> int:
-    """3 where an undamped oscillation with w h = 1 is damped by the stepper itself, else 2."""
+    """3 if the stepper damps an undamped oscillation with w h = 1, otherwise 2."""
     return 2 if float(damping_ratio(stepper, 1.0)) <= UNDAMPED else 3  # it is NaN where none is left
 
 
@@ -156,7 +159,7 @@ def _warn_if_shifted(params: PyTree, shift, dt):
     named = [f"{n} ({s:+.1f})" for n, s in zip(parameter_names(params), sizes, strict=True) if abs(s) > 1]
     if named:
         warnings.warn(
-            f"refine: steps of {dt:.6g} shift {', '.join(named)} by that many standard errors.",
+            f"refine: steps of {dt:.6g} shift {', '.join(named)}; in brackets the shift in standard errors.",
             StepSizeWarning,
             stacklevel=3,
         )

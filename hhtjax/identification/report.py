@@ -1,4 +1,4 @@
-"""A fit for readers: a text table, and JSON."""
+"""The text of `FitResult.summary`, and fits as JSON."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ if TYPE_CHECKING:
     from hhtjax.identification.result import FitResult
     from hhtjax.identification.sandwich import Uncertainty
 
-CLOSE = 0.95  # correlation of two estimates that is worth a word
+CLOSE = 0.95  # correlation of two estimates from which on it is reported
 MOST_PAIRS = 3
 AT_BOUND = 0.01  # standard errors
 ADVICE = (
-    "the residual is not white, and fades: of a motion that dies away, as by friction, this may be a false minimum; "
-    "try other starts (multistart), or windows of the record with starts of their own (windows)"
+    "the residual is not white, and is smaller at the end of the record: if the motion decays, as with friction, this "
+    "may be a false minimum; try other initial guesses (multistart), or cut the record into windows (windows)"
 )
 
 
 def summary(result: FitResult) -> str:
     """The text of `FitResult.summary`."""
     cost = f"cost {float(result.cost):.6g}, {float(result.history.cost[0]):.6g} at the start"
-    chosen = "" if result.choices is None else f"; steps chosen {int(result.choices)} times, and frozen"
+    chosen = "" if result.choices is None else f"; steps of the runs chosen {int(result.choices)} times"
     lines = [f"{result.reason}; {int(result.iterations)} iterations, {cost}{chosen}"]
     names, values = parameter_names(result.params), parameter_values(result.params)
     rows = [["parameter", "estimate"]]
@@ -63,14 +63,14 @@ def summary(result: FitResult) -> str:
 
 @partial(jax.jit, static_argnames=("kind", "transforms"))
 def _believed(kind: type, transforms: tuple, params: PyTree, uncertainty: Uncertainty, code: Array):
-    """Standard errors, interval, naive errors, frozen, and correlations: one program in the place of some fifty."""
+    """Standard errors, interval, naive errors (all frozen), and correlations: one program instead of some fifty."""
     result = kind(thaw(params), None, None, None, None, code, transforms, uncertainty, 0)
     found = result.standard_errors, *result.interval(), result.errors(uncertainty.naive)
     return *map(freeze, found), result.correlation
 
 
 def table(result) -> Table:
-    """Verdict and estimates with their standard errors; of a batch, or of tracers, what is known without them."""
+    """Title and table of estimates with standard errors. For a batch or tracers: only what is known of their arrays."""
     numbers = all_known((result.code, result.iterations, result.cost, result.params))
     if len(numbers) <= 3 or numbers[0].ndim:
         title = f"cost {brief(result.cost)}"
@@ -101,13 +101,13 @@ def _columns(free: Real, error: Real, lower: Real, upper: Real, naive: Real):
 
 
 def _about_residuals(result: FitResult):
-    """How many there are and what they are worth, how large, whether they are white; starts that were fitted too."""
+    """Lines on the residuals: their number and effective number, size, whiteness; and on the fitted starts."""
     residuals = residuals_of(result)
     n = count(residuals)
     missing = sum(x.size for x in residuals.plain) - n
     words = [f"observations: {n}{f' and {missing} missing' if missing else ''}"]
     if result.uncertainty is not None:
-        words.append(f"worth {effective_observations(n, result.uncertainty):.0f} independent ones")
+        words.append(f"as informative as {effective_observations(n, result.uncertainty):.0f} independent ones")
     lines = [", ".join(words)]
     leaves = zip(residuals.names, residuals.plain, residuals.present, strict=True)
     words = ["residual: rms " + ", ".join(f"{name} {rms(r, here):.4g}".strip() for name, r, here in leaves)]
@@ -125,25 +125,26 @@ def _about_residuals(result: FitResult):
         lines.append(ADVICE)
     if starts:
         each = sum(map(np.size, starts)) // len(starts[0])
-        lines.append(f"starts: of {len(starts[0])} records, {each} unknowns each")
+        lines.append(f"starts: fitted for {len(starts[0])} records, {each} unknowns each")
     return lines
 
 
 def _about_estimates(result, names, errors: np.ndarray, R: np.ndarray):
-    """Where standard errors come from, what is not determined, and what is only together."""
+    """Lines on the origin of the standard errors, on undetermined parameters, and on correlations."""
     believed = result.uncertainty
-    segments = f"how much {result.segments} segments of the record disagree (cluster sandwich)"
+    segments = f"the scatter between {result.segments} segments of the record (cluster sandwich)"
     kind = f"from {segments}" if believed.cluster is not None else "from the autocorrelation of the residuals"
     remarks = [f"standard errors: {kind}"]
     if believed.degrees is not None:
         worth, own = 1 + np.asarray(believed.degrees), names[result.free]
         few = [i for i in np.argsort(worth)[:MOST_PAIRS] if worth[i] < result.segments / 2]
-        remarks[0] += f"; worth {', '.join(f'{worth[i]:.0f} for {own[i]}' for i in few)}" if few else ""
+        told = ", ".join(f"{worth[i]:.0f} for {own[i]}" for i in few)
+        remarks[0] += f"; effective number of segments: {told}" if few else ""
     unknown, why = why_undetermined(result)
     if unknown:
         remarks.append(f"undetermined: {', '.join(unknown)}: {why}")
     if bound := names[_at_bound(result, errors)].tolist():
-        remarks.append(f"at a bound: {', '.join(bound)}; standard errors are those without it")
+        remarks.append(f"at a bound: {', '.join(bound)}; standard errors ignore the bound")
     if np.sum(result.free) - len(unknown) > 1:
         rows, columns = np.triu_indices(len(R), 1)
         size = np.abs(R[rows, columns])
@@ -168,7 +169,7 @@ TRANSFORMS = {"scaled": tf.scaled, "positive": tf.positive, "fixed": tf.fixed}
 
 
 def encode(x: Any) -> Any:
-    """A pytree of named tuples, dicts, lists, tuples, arrays, transforms and steppers, as what JSON can hold."""
+    """Converts a pytree of named tuples, dicts, lists, tuples, arrays, transforms and steppers to JSON values."""
     if x is None or isinstance(x, (int, float, str)):
         return x
     if isinstance(x, tf.Bounded):
@@ -191,7 +192,7 @@ def encode(x: Any) -> Any:
 
 
 def read(text: str, kind: type, named: dict) -> Any:
-    """What the to_json of a kind wrote; named: as for `decode`."""
+    """Reads the text that the to_json of a class wrote. named: as for `decode`."""
     try:
         found = decode(json.loads(text), named)
     except (KeyError, TypeError, AttributeError) as error:
@@ -204,7 +205,7 @@ def read(text: str, kind: type, named: dict) -> Any:
 
 
 def decode(x: PyTree, named: dict) -> Any:
-    """The inverse of `encode`; named: the classes of named tuples and steppers, by name."""
+    """The inverse of `encode`. named: the classes of named tuples and steppers, by name."""
     if not isinstance(x, dict):
         return x
     kind: Any

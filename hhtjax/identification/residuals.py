@@ -1,4 +1,4 @@
-"""What the residuals of a fit return, checked, and the weights of it."""
+"""Checks of the residuals of a fit, and of their weights."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def check_residuals(caller: str, residuals: Callable | Reading, p: int, *args: PyTree) -> PyTree:
-    """The shapes and dtypes of residuals(*args), if they are good for p parameters."""
+    """The shapes and dtypes of residuals(*args), after a check that they can determine p parameters."""
 
     def real(*args: PyTree) -> PyTree:
         result = residuals(*args)
@@ -33,8 +33,8 @@ def check_residuals(caller: str, residuals: Callable | Reading, p: int, *args: P
         shapes = jax.eval_shape(lambda *args: real(*thaw(args)), *freeze(args))
     except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
         raise TypeError(
-            f"{caller}: `residuals` must be traceable by JAX, with jax.numpy in place of NumPy, float() and `if` "
-            f"wherever params come in; received {residuals!r}, whose error stands above."
+            f"{caller}: `residuals` must be traceable by JAX: use jax.numpy instead of NumPy, float() and `if` for all "
+            f"that depends on params; received {residuals!r}, whose error stands above."
         ) from error
     leaves = jax.tree.leaves(shapes)
     for leaf in leaves:
@@ -69,7 +69,7 @@ def spread_weights(caller: str, weights: Real, shapes, name: str = "weights"):
 
 
 def check_weights(caller: str, weights: PyTree):
-    """Finite numbers, or Booleans: True to keep, False for a missing sample."""
+    """Raises an error unless the weights are finite numbers or Booleans (False: a missing sample)."""
     if weights is None:
         raise TypeError(f"{caller}: `weights` must be a number, an array or a pytree of them; received None.")
     for path, leaf in jax.tree_util.tree_leaves_with_path(weights):
@@ -81,7 +81,7 @@ def check_weights(caller: str, weights: PyTree):
 
 
 def first_bad(residual, weights, of_records=False):
-    """Words for what a sum of squares cannot have: entries not finite and not declared missing, or too large."""
+    """Describes the first residual that makes the cost infinite or NaN: not finite and not missing, or too large."""
     present = spread_weights("fit", weights, residual)
     values = [
         (path, np.where(np.asarray(w) == 0, 0, np.asarray(leaf)))
@@ -106,14 +106,14 @@ def first_bad(residual, weights, of_records=False):
 
 
 # ----------------------------------------------------------------------------
-# Residuals of every sample less every other: (n, 1) less (n,) is (n, n) to NumPy, which is never meant in a fit.
+# A frequent mistake: (n, 1) minus (n,) broadcasts to (n, n), every sample minus every other. A fit never means this.
 
 
 def require_own_samples(caller: str, residuals: Callable | Reading, shapes: PyTree, *args: PyTree):
-    """An error where a leaf of residuals(*args) is (n, n), made by promoting a rank, and of no data of that size.
+    """Raises an error if a leaf of residuals(*args) is (n, n) only because ranks were promoted.
 
-    Nothing is traced unless a leaf is (n, n). What is written on purpose is let through: an outer sum whose two ranks
-    are written out, and one from which measurements (n, n) are taken.
+    Nothing is traced unless a leaf is (n, n). Two cases are taken as intended: an outer sum whose axes are written out,
+    and one from which measurements of shape (n, n) are subtracted.
     """
     leaves = jax.tree_util.tree_leaves_with_path(shapes)
     square = [i for i, (_, leaf) in enumerate(leaves) if leaf.ndim == 2 and leaf.shape[0] == leaf.shape[1] > 1]
@@ -127,13 +127,13 @@ def require_own_samples(caller: str, residuals: Callable | Reading, shapes: PyTr
             n, where = leaf.shape[0], jax.tree_util.keystr(path)
             raise ValueError(
                 f"{caller}: `residuals` must be one for each sample; received {leaf.shape}{where and f' at {where}'}, "
-                f"of arrays ({n}, 1) and ({n},), each sample of one less all of the other. Give both the same shape: "
-                "`run.q[:, 0] - y`."
+                f"from arrays ({n}, 1) and ({n},): every sample of one minus every sample of the other. Give both the "
+                "same shape: `run.q[:, 0] - y`."
             )
 
 
 def _promotes_ranks(residuals, args):
-    """Whether JAX has to, somewhere."""
+    """Whether JAX promotes a rank anywhere in residuals(*args)."""
     try:
         with jax.numpy_rank_promotion("raise"):
             jax.eval_shape(lambda *args: residuals(*thaw(args)), *freeze(args))
@@ -148,8 +148,10 @@ def _makers(jaxpr):
 
 
 def _spread(y, makers) -> set:
-    """Along which axes a matrix varies that elementwise operations make of vectors; both twice, {0, 1, 2}, where
-    anything else, such as a matrix of measurements, is in it."""
+    """The axes along which a matrix varies if it is made of vectors by elementwise operations.
+
+    The result is {0, 1, 2} if anything else, such as a matrix of measurements, enters it.
+    """
     # a number in a program has `val`, and no maker
     other, shape = {0, 1, 2}, y.aval.shape
     if hasattr(y, "val") or min(shape, default=1) == 1:

@@ -25,27 +25,28 @@ FEW = 16  # degrees of freedom
 
 @shown
 class FitResult(NamedTuple):
-    """An estimate, how it was reached, and how far to trust it.
+    """Result of `fit`: an estimate, its standard errors, and the course of the fit.
 
     Attributes:
         params: the estimate, structured like params0.
-        residual: residuals(params), as the user's function gives it.
-        cost: 1/2 sum rho(weighted residual^2), and of priors.
-        history: `History`, NaN after the last iteration when made inside jit.
-        iterations: how many.
-        code: why it stopped, a number; `reason` says it in words.
-        transforms: of each leaf.
-        uncertainty: `Uncertainty` of the free entries; None if not asked for.
-        segments: how many parts of the record the covariance rests on.
-        starts: the unknowns of each record, with a leading axis; None where `fit` was given no records.
+        residual: residuals(params), as your function returns it.
+        cost: 1/2 sum rho(weighted residual^2), plus the terms of the priors.
+        history: `History`. If the fit was made inside jit, entries after the last iteration are NaN.
+        iterations: number of iterations.
+        code: why the fit stopped, a number. `reason` gives it in words.
+        transforms: the transform of each leaf of params.
+        uncertainty: `Uncertainty` of the fitted entries; None with covariance=False.
+        segments: number of parts of the record from which the covariance was computed.
+        starts: the fitted unknowns of each record, with a leading axis; None without `records`.
         weights: as given to `fit`.
-        choices: of residuals with runs under error control (`adaptive`), how often their steps were chosen, and
-            frozen, for estimates, until these stayed; None without.
+        choices: for residuals that simulate under error control (`adaptive`): how often the steps were chosen anew
+            until the estimates no longer changed; otherwise None.
 
-    `covariance` (p, p), whose rows follow ravel_pytree(params), and `standard_errors`, the root of its diagonal,
-    structured like params, come from how much segments of the record disagree (a cluster-robust covariance:
-    `Uncertainty`), or from the autocorrelation of the residuals where parameters outnumber segments. A fixed parameter
-    has variance 0; one that the residuals do not determine has inf, and covariances 0.
+    `covariance` is (p, p); its rows follow ravel_pytree(params). `standard_errors` are the square roots of its
+    diagonal, structured like params. Both come from the scatter between segments of the record (a cluster-robust
+    covariance: see `Uncertainty`). If there are no more segments than parameters, they come from the autocorrelation of
+    the residuals. A fixed parameter has variance 0. A parameter that the residuals do not determine has variance inf
+    and covariances 0.
     """
 
     params: PyTree
@@ -63,18 +64,18 @@ class FitResult(NamedTuple):
 
     @property
     def converged(self) -> Any:
-        """Whether a tolerance was met."""
+        """Whether the fit ended because a tolerance was met."""
         return (self.code == COST) | (self.code == STEP) | (self.code == GRADIENT)
 
     @property
     def reason(self) -> str:
-        """Why it stopped, in words."""
+        """Why the fit stopped, in words."""
         self._require_one()
         return REASONS[int(self.code)]
 
     @property
     def free(self) -> np.ndarray:
-        """Whether each entry of ravel_pytree(params) was fitted, (p,)."""
+        """(p,) Booleans: which entries of ravel_pytree(params) were fitted."""
         self._require_one()
         leaves = zip(self.transforms, jax.tree.leaves(freeze(self.params)), strict=True)
         return np.concatenate([np.full(np.size(x), T is not tf.fixed) for T, x in leaves])
@@ -82,45 +83,46 @@ class FitResult(NamedTuple):
     def _require_one(self):
         if jnp.ndim(self.code):
             raise ValueError(
-                f"FitResult: must be of one fit; this is a batch, of shape {jnp.shape(self.code)}. Its member i is "
+                f"FitResult: must hold one fit; received a batch of shape {jnp.shape(self.code)}. Select member i by "
                 "jax.tree.map(lambda x: x[i], result)."
             )
 
     @property
     def covariance(self) -> Any:
-        """(p, p), or None."""
+        """Covariance of the estimates, (p, p); None with covariance=False."""
         return None if self.uncertainty is None else self.embed(self.uncertainty.covariance)
 
     @property
     def standard_errors(self) -> Any:
-        """Structured like params, or None."""
+        """Standard errors, structured like params; None with covariance=False."""
         return None if self.uncertainty is None else self.errors(self.uncertainty.covariance)
 
     @property
     def correlation(self) -> Any:
-        """Of the estimates, (p, p), or None."""
+        """Correlation matrix of the estimates, (p, p); None with covariance=False."""
         return None if self.uncertainty is None else correlation(self.covariance)
 
     def embed(self, covariance: PyTree) -> Array:
-        """A covariance of the free entries with rows of zeros for the fixed ones, (p, p)."""
+        """(p, p): a covariance of the fitted entries, with zero rows and columns added for the fixed ones."""
         at = np.flatnonzero(self.free)
         p = len(self.free)
         return jnp.zeros((p, p), covariance.dtype).at[np.ix_(at, at)].set(covariance)
 
     def errors(self, covariance: Array) -> PyTree:
-        """Standard errors from a covariance of the free entries, structured like params."""
+        """Standard errors, structured like params, from a covariance of the fitted entries."""
         _, unravel = ravel_pytree(freeze(self.params))
         return thaw(unravel(jnp.sqrt(jnp.diagonal(self.embed(covariance)))))
 
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """Lower and upper ends of each parameter's confidence interval, two pytrees like params.
 
-        Student's t with the `degrees` of freedom of `Uncertainty`, symmetric in the coordinate that was fitted: for a
-        `positive` parameter p exp(-+ t sigma/p), which stays positive. A parameter closer than t sigma to a bound has
-        p -+ t sigma, cut off there: it cannot be told from the bound.
+        The half width is t sigma, with the standard error sigma and Student's t for the `degrees` of freedom of
+        `Uncertainty`. The interval is symmetric in the coordinate that was fitted: for a `positive` parameter its ends
+        are p exp(-+ t sigma/p), which stay positive. If a parameter is closer than t sigma to a bound, its ends are
+        p -+ t sigma, cut off at the bound: the data do not distinguish it from the bound.
 
         Raises:
-            TypeError, ValueError: level is no number between 0 and 1; a fit without covariance.
+            TypeError, ValueError: level is not a number between 0 and 1; a fit without covariance.
         """
         require_number("interval", "level", level, lambda x: 0 < x < 1, "lie between 0 and 1")
         if self.uncertainty is None:
@@ -135,11 +137,12 @@ class FitResult(NamedTuple):
         return lower, upper
 
     def summary(self) -> str:
-        """A table of estimates, standard errors and intervals, and what limits them.
+        """Text: a table of estimates, standard errors and intervals, and remarks on their quality.
 
-        Below it: how many observations there are, and how many independent ones they are worth (`compare` has the
-        formula); the rms of the residual, in its unit, and whether it is white (Ljung and Box 1978); where the standard
-        errors come from; what is not determined, and what is only together.
+        The remarks give the number of observations, and the number of independent ones that would carry as much
+        information (formula in `compare`); the rms of the residual, in its unit, and whether it is white (Ljung and Box
+        1978); how the standard errors were computed; which parameters are not determined; and the largest correlations
+        between estimates.
 
         >>> import jax.numpy as jnp, hhtjax
         >>> wave = jnp.sin(jnp.arange(400.0))
@@ -156,16 +159,16 @@ class FitResult(NamedTuple):
         return report.table(self)
 
     def plot(self, sampling_rate: float = 1.0) -> Any:
-        """The figure of `hhtjax.plot.fit_overview`."""
+        """Draws `hhtjax.plot.fit_overview` and returns its axes."""
         return CHARTS["FitResult"](self, sampling_rate)
 
     def to_json(self) -> str:
-        """The whole result as JSON, for `FitResult.from_json`; inf and NaN as Python writes them."""
+        """The whole result as JSON text, to be read by `FitResult.from_json`. inf and NaN as in Python."""
         return json.dumps(report.encode(self))
 
     @staticmethod
     def from_json(text: str) -> FitResult:
-        """What `to_json` wrote. params of dicts, lists and tuples."""
+        """Reads a result from the text of `to_json`. params must consist of dicts, lists, tuples and arrays."""
         return report.read(text, FitResult, NAMED)
 
 
@@ -186,9 +189,12 @@ def _ends(T, p: Array, reach: Array):
 
 
 def student(level: Real, degrees: Array | None) -> Real:
-    """Two-sided quantile of Student's t, by Cornish and Fisher's expansion about the normal one (None: normal); of few
-    degrees of freedom, where the expansion is far off, by bisection, and between integers by interpolation of log t
-    over 1/degrees: to 4 %, between 1 and 2."""
+    """Two-sided quantile of Student's t; degrees None: of the normal distribution.
+
+    Computed by Cornish and Fisher's expansion about the normal quantile. For few degrees of freedom this expansion is
+    too inaccurate: there integers are solved by bisection, and values between them by interpolation of log t over
+    1/degrees, with an error of up to 4 % between 1 and 2.
+    """
     z = statistics.NormalDist().inv_cdf((1 + level) / 2)
     if degrees is None:
         return z

@@ -1,11 +1,11 @@
-"""Robots from encoder and torque records: inertias that a body can have, what is identifiable, motions that tell.
+"""Identification of robots from records of encoders and torques.
 
-    physical_inertia        ten numbers without limits -> mass, com, inertia of a body that exists
-    base_parameters         the combinations of inertial parameters that a motion can tell
-    excitation              a periodic motion whose regressor is well conditioned, found by gradient
+    physical_inertia        any ten numbers -> mass, centre of mass and inertia that are physically possible
+    base_parameters         the combinations of inertial parameters that a motion can identify
+    excitation              a periodic motion with a well conditioned regressor, found by gradients
 
-A fit begins with `equation_error`, which simulates nothing, and ends through the step with `fit`. An example, from a
-model file to friction with its interval, is in `hhtjax.bodies`.
+First fit with `equation_error`, which needs no simulation. Then fit through the simulation, starting at this estimate.
+An example, from a model file to a friction parameter with its confidence interval, is in `hhtjax.bodies`.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from hhtjax.checks import require_integer, require_number
 from hhtjax.description import Array, Real, is_concrete
 from hhtjax.description.presentation import shown
 
-RANK = 1e-8  # of the largest singular value, below which a combination of parameters moves nothing
+RANK = 1e-8  # of the largest singular value, below which a combination of parameters has no effect
 NAMES = "m", "m cx", "m cy", "m cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz"
 
 
 def physical_inertia(theta: Array) -> dict[str, Array]:
-    """Mass, centre of mass and inertia of a body that exists, whatever the ten numbers: the log-Cholesky map.
+    """Maps any ten numbers to a physically possible mass, centre of mass and inertia (log-Cholesky map).
 
         U = exp(alpha) [[exp(d1), s12, s13, t1], [0, exp(d2), s23, t2], [0, 0, exp(d3), t3], [0, 0, 0, 1]]
         U U^T = [[Sigma, m c], [m c^T, m]],    I = tr(Sigma_c) 1 - Sigma_c
 
-    So m = exp(2 alpha), c = t, and with A the upper triangle of the d and s, Sigma_c = m A A^T.
+    So m = exp(2 alpha) and c = t. With the upper triangular matrix A of the d and s, Sigma_c = m A A^T.
 
     Args:
         theta: (..., 10): alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3.
 
     Returns:
-        A dict: mass (...,), kg; com (..., 3), m; inertia (..., 3, 3), about the centre of mass, kg m^2: entries of
-        `Mechanism.params`.
+        A dict: mass (...,), kg; com (..., 3), m; inertia (..., 3, 3), about the centre of mass, kg m^2. These are
+        entries of `Mechanism.params`.
 
     Raises: ValueError: theta of another shape.
 
@@ -69,7 +69,7 @@ def physical_inertia(theta: Array) -> dict[str, Array]:
 
 
 def inertia_coordinates(mass: Real, com: Array, inertia: Array) -> Array:
-    """theta (..., 10) of `physical_inertia`: where a fit starts.
+    """The inverse of `physical_inertia`: theta (..., 10), for the initial guess of a fit.
 
     Args: mass: (...,), kg, > 0. com: (..., 3), m. inertia: (..., 3, 3), about the centre of mass, kg m^2.
 
@@ -77,8 +77,8 @@ def inertia_coordinates(mass: Real, com: Array, inertia: Array) -> Array:
         theta, (..., 10).
 
     Raises:
-        ValueError: no mass, or an inertia of no body with an extent in all directions: a moment as large as the sum of
-            the others.
+        ValueError: the mass is not positive, or the inertia is impossible for a body with an extent in all directions:
+            one principal moment is as large as the sum of the others.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> moments = jnp.diag(jnp.array([1.0, 2.0, 2.5]))
@@ -94,8 +94,8 @@ def inertia_coordinates(mass: Real, com: Array, inertia: Array) -> Array:
         least = np.linalg.eigvalsh(np.asarray(Sigma))[..., 0]
         if np.any(np.asarray(m) <= 0) or np.any(least <= 1e-12 * np.asarray(trace)[..., 0, 0]):
             raise ValueError(
-                "inertia_coordinates: the mass must be positive, and each principal moment smaller than the sum of the "
-                f"others, as of a body with an extent in all directions; received mass {mass} and inertia {inertia}."
+                "inertia_coordinates: `mass` must be positive, and each principal moment of `inertia` smaller than the "
+                f"sum of the others; received mass {mass} and inertia {inertia}."
             )
     # an upper triangle: the lower one of the axes in reverse order
     A = jnp.linalg.cholesky((Sigma / m[..., None, None])[..., ::-1, ::-1])[..., ::-1, ::-1]
@@ -106,15 +106,16 @@ def inertia_coordinates(mass: Real, com: Array, inertia: Array) -> Array:
 
 @shown
 class BaseParameters(NamedTuple):
-    """What motions can tell of the inertial parameters of a robot; made by `base_parameters`.
+    """Result of `base_parameters`: the combinations of inertial parameters of a robot that motions can identify.
 
     Attributes:
-        count: r, how many independent numbers.
-        independent: (r,), which of the 10 nb parameters stand for them, by number.
-        names: of these, such as "link2 m cx".
-        combination: (r, 10 nb), with beta = combination theta: what is identified. Its columns of `independent` are 1.
-        unseen: names of those that enter no motion at all.
-        condition: of the regressor of `independent`, each column of length 1.
+        count: r, the number of independent combinations.
+        independent: (r,), indices of r independent parameters among the 10 nb inertial parameters of nb bodies.
+        names: names of these, such as "link2 m cx".
+        combination: (r, 10 nb). The identifiable numbers are beta = combination theta. The columns of `independent`
+            form an identity matrix.
+        unseen: names of the parameters that have no effect on any motion.
+        condition: condition number of the regressor of `independent`, with columns scaled to length 1.
     """
 
     count: int
@@ -126,13 +127,13 @@ class BaseParameters(NamedTuple):
 
 
 def base_parameters(robot: Mechanism, *, samples: int = 200, motion: Any = None, seed: int = 0) -> BaseParameters:
-    """Which combinations of the inertial parameters a motion can tell: by the rank of the regressor.
+    """Finds the combinations of inertial parameters that motions can identify, by the rank of the regressor.
 
     Args:
         robot: a `Mechanism`.
-        samples: of random states, when no motion is given.
-        motion: q, v, w, each with a leading axis of samples: what these tell, in the place of all.
-        seed: of the random states.
+        samples: number of random states, used if no motion is given.
+        motion: q, v, w, each with a leading axis of samples. The result is then for this motion instead of all motions.
+        seed: seed of the random states.
 
     Returns:
         A `BaseParameters`.
@@ -176,15 +177,15 @@ def _require_robot(caller: str, robot):
     if not isinstance(robot, Mechanism):
         raise TypeError(f"{caller}: `robot` must be a Mechanism, of bodies.tree or bodies.load; received {robot!r}.")
     if robot.model.loops:
-        raise NotImplementedError(f"{caller}: `robot` has loops, and its joints cannot move on their own.")
+        raise NotImplementedError(f"{caller}: `robot` has loops, so its joints cannot move independently.")
 
 
 def _random_states(robot: Mechanism, samples: int, seed: int):
-    """Positions off q0 by a radian or a metre, rates and accelerations of a few units."""
+    """Random states: positions up to pi rad or m from q0, rates up to 2, accelerations up to 5, in SI units."""
     rng = np.random.default_rng(seed)
     tree = robot.model.tree
     if tree.balls:
-        raise NotImplementedError("base_parameters: for robots with balls or free joints, give `motion`.")
+        raise NotImplementedError("base_parameters: `motion` must be given for robots with ball or free joints.")
     q, v, w = rng.uniform(-1, 1, (3, samples, tree.rates))
     return np.asarray(robot.q0) + np.pi * q, 2 * v, 5 * w
 
@@ -192,7 +193,7 @@ def _random_states(robot: Mechanism, samples: int, seed: int):
 class Fourier(NamedTuple):
     """A periodic motion, q(t) = centre + sum over k of (a_k sin(k w t) - b_k cos(k w t))/(k w), w = 2 pi/period.
 
-    A pytree, to be put into params and called with t, as what a controller is to follow.
+    It is a pytree and can be put into params, as the set point of a controller. Call it with t.
 
     Attributes:
         centre: (n,). a, b: (K, n), rad/s or m/s. period: s.
@@ -217,12 +218,13 @@ class Fourier(NamedTuple):
 
 @shown
 class Excitation(NamedTuple):
-    """A motion to identify a robot by; made by `excitation`.
+    """Result of `excitation`: a motion for the identification of a robot.
 
     Attributes:
-        trajectory: a `Fourier`, called with t.
-        condition: of the regressor along it, columns of length 1 over the parameters that motions can tell.
-        start: the same of the random motion that the search began with.
+        trajectory: a `Fourier`; `trajectory(t)` is q.
+        condition: condition number of the regressor of the identifiable parameters along it, with columns scaled to
+            length 1.
+        start: condition number for the random motion at which the search began.
         base: the `BaseParameters` of the robot.
     """
 
@@ -245,22 +247,22 @@ def excitation(
     iterations: int = 200,
     seed: int = 0,
 ) -> Excitation:
-    """A periodic motion of all joints whose regressor is large and well conditioned, found by gradient (L-BFGS).
+    """Finds a periodic motion of all joints whose regressor is large and well conditioned, by gradients (L-BFGS).
 
-    The regressor Y along the motion gives torques from parameters. With its columns y_j scaled to one length, and p
-    of them, the cost is
+    The regressor Y along the motion maps parameters to torques. It has p columns y_j. The search minimises
 
-        log cond(Y) - (1/p) sum_j log |y_j|,
+        log cond(Y with columns scaled to one length) - (1/p) sum_j log |y_j|,
 
-    with a penalty on what leaves the ranges. The first term tells parameters apart, the second lifts them out of the
-    noise: without it the motion is slow and small.
+    plus a penalty for leaving the ranges. The first term makes the parameters distinguishable. The second makes their
+    torques large compared with the noise; without it the motion would be slow and small.
 
     Args:
         robot: a `Mechanism` of hinges and slides.
-        period: s. harmonics: K, of each joint.
-        amplitude: how far from `centre`, rad or m; speed, acceleration: largest ones; numbers or (n,).
+        period: s. harmonics: K, number of harmonics of each joint.
+        amplitude: largest distance from `centre`, rad or m; speed, acceleration: largest values; numbers or (n,).
         centre: (n,), None for q0.
-        samples: of a period, where the regressor is taken. iterations: of the search. seed: of its start.
+        samples: number of samples of a period at which the regressor is evaluated.
+        iterations: largest number of iterations of the search. seed: seed of its random start.
 
     Returns:
         An `Excitation`.
@@ -293,7 +295,7 @@ def excitation(
         return Fourier(centre, a, b, jnp.asarray(float(period)))
 
     def values(x: Real):
-        """Singular values of the scaled regressor, the mean logarithm of its columns, how much ranges are left."""
+        """Singular values of the scaled regressor, mean log of its column lengths, and how far ranges are exceeded."""
         q, v, w = jax.vmap(trajectory(x).motion)(t)
         Y = jax.vmap(lambda q, v, w: regressor(robot, q, v, w))(q, v, w)[..., base.independent]
         Y = Y.reshape(-1, base.count)
@@ -311,7 +313,7 @@ def excitation(
     x0 = rng.normal(size=2 * harmonics * n)
 
     def largest(x: np.ndarray) -> float:
-        """Part of its range that the motion takes, at four times as many times; a range is linear in x."""
+        """Largest part of a range that the motion uses, at four times as many samples. It is linear in x."""
         q, v, w = jax.vmap(trajectory(x).motion)(np.arange(4 * samples) * (float(period) / samples / 4))
         moves = zip((q - centre[None, :], v, w), limits, strict=True)
         return max(float(np.max(np.abs(y) / limit[None, :])) for y, limit in moves)

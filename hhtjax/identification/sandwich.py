@@ -1,21 +1,22 @@
-"""Covariance of a least-squares estimate: what to believe when residuals are correlated, as after any model error.
+"""Covariance of a least-squares estimate, also for correlated residuals, which any error of the model causes.
 
-With the Jacobian J and the residual r at the estimate, each covariance is a sandwich
+With the Jacobian J and the residual r at the estimate, each covariance is a "sandwich"
 
     (J^T J)^-1 S (J^T J)^-1,      S = variance of J^T r:
 
-    naive            S = s^2 J^T J,  s^2 = sum r^2/(m - p):  independent residuals of equal variance; p less what
-                     priors tell of the parameters
+    naive            S = s^2 J^T J,  s^2 = sum r^2/(m - p):  independent residuals of equal variance; p is reduced by
+                     the share of information on the parameters that comes from priors
     autocorrelated   S = tau s^2 J^T J,  tau = 1 + 2 sum_k (1 - k/L) rho_k,  rho_k the autocorrelation of r (Bartlett)
     cluster          S = sum_g s_g s_g^T,  s_g = J_g^T (1 - H_g)^(-1/2) r_g,  over segments g of the residual that are
-                     long against its correlation time; H_g = J_g (J^T J)^-1 J_g^T is the part of r_g that the fit took
+                     long compared with its correlation time; H_g = J_g (J^T J)^-1 J_g^T gives the part of r_g that the
+                     fit has removed
 
-(Liang and Zeger 1986, with the correction "CR2" of Bell and McCaffrey 2002: S has no bias for white residuals.) A
-combination of parameters that a single segment determines, such as its initial state, leaves no residual to estimate
-its variance from: there, that of the autocorrelated S stands in. A prior adds its own precision to S.
+(Liang and Zeger 1986, with the correction "CR2" of Bell and McCaffrey 2002: S has no bias for white residuals.) If a
+single segment determines a combination of parameters, such as its initial state, no residual is left from which its
+variance could be estimated. The autocorrelated S is used there instead. A prior adds its own precision to S.
 
-With a loss rho (Huber 1981, Ch. 7, an M-estimate) psi(r), half the derivative of rho(r^2), stands for r in S, and
-J^T diag(psi'(r)) J for J^T J outside of it.
+With a loss rho the estimate is an M-estimate (Huber 1981, Ch. 7). Then psi(r), half the derivative of rho(r^2),
+replaces r in S, and J^T diag(psi'(r)) J replaces J^T J outside S.
 """
 
 from __future__ import annotations
@@ -33,28 +34,29 @@ from hhtjax.identification.gauss_newton import triangle
 from hhtjax.numerics.array_namespace import eigh, namespace_of, svd
 
 SEGMENTS = 32
-LEAST = 8  # segments that tell of a variance by how much they disagree
+LEAST = 8  # segments at least, to estimate a variance from their scatter
 FLAT = 1e-6  # curvature of the cost beside that of the sum of squares, at which a loss counts as flat
 ALONE = 0.75  # share of the information on a combination of parameters, above which its segment has taken it all
 
 
 @shown
 class Uncertainty(NamedTuple):
-    """Covariances (p, p) of the free entries, in the order of `ravel_pytree(params)`, and what the residuals determine.
+    """Covariances (p, p) of the fitted entries, in the order of `ravel_pytree(params)`, and measures of determinacy.
 
     Attributes:
-        cluster: from how much segments of the record disagree, the "cluster sandwich" (`hhtjax.identification.sandwich`
-            has formulas and sources); None where there are no more segments than parameters.
-        naive: the textbook's, as if every residual were independent noise.
-        autocorrelated: the textbook's, with the correlation that the residuals have.
-        singular_values: (p,), of the Jacobian with columns scaled to one, largest first: a small one belongs to a
-            combination of parameters that hardly matters.
-        directions: (p, p), a row for each of these: the change of the parameters, in their units.
-        undetermined: (p,), parameters in a combination that does not matter at all; their variance is inf, and their
-            covariances are 0.
-        inverse: of the second derivative of the cost, J^T diag(psi') J.
-        degrees: (p,), of freedom of the cluster variances: one less than there are segments, where each says as much of
-            a parameter, and less where a few say most of it (Satterthwaite, for white residuals); None without.
+        cluster: the covariance from the scatter between segments of the record, the "cluster sandwich" (formulas and
+            sources: `hhtjax.identification.sandwich`); None if there are no more segments than parameters.
+        naive: the textbook's covariance, which assumes that every residual is independent noise.
+        autocorrelated: the textbook's covariance, corrected for the autocorrelation of the residuals.
+        singular_values: (p,), singular values of the Jacobian with columns scaled to length one, largest first. A small
+            one belongs to a combination of parameters that hardly affects the residuals.
+        directions: (p, p), the combination for each singular value, as a row: changes of the parameters in their units.
+        undetermined: (p,) Booleans: parameters in a combination that has no effect on the residuals. Their variance is
+            inf, and their covariances are 0.
+        inverse: inverse of the second derivative of the cost, J^T diag(psi') J.
+        degrees: (p,), degrees of freedom of the cluster variances: one less than the number of segments if all segments
+            carry the same information on a parameter, and less if a few segments carry most of it (Satterthwaite, for
+            white residuals); None without `cluster`.
     """
 
     cluster: Array
@@ -68,7 +70,7 @@ class Uncertainty(NamedTuple):
 
     @property
     def covariance(self) -> Array:
-        """The cluster sandwich; the autocorrelated one where there is none."""
+        """The cluster covariance, or the autocorrelated one if there is none."""
         return self.autocorrelated if self.cluster is None else self.cluster
 
 
@@ -81,37 +83,39 @@ def correlation(covariance: Array) -> Array:
 
 
 def used_up(present: np.ndarray, entries: int) -> Real:
-    """How many residuals the starts of records take: of each as many as a start has entries, or as there are.
+    """Number of residuals used up by fitting the starts of records.
 
-    present: (records, m), whether a residual is there; of NumPy or JAX.
+    Each record uses as many as its start has entries, but no more than it has residuals. present: (records, m), whether
+    a residual is present; a NumPy or JAX array.
     """
     return present.sum(axis=1).clip(max=entries).sum()
 
 
 def _length(n: int, segments: int, block: int) -> int:
-    """Of each of at most `segments` equal parts of n rows, of which `block` after another stay together."""
+    """Length of a part if n rows are cut into at most `segments` equal parts of whole blocks of `block` rows."""
     return -(-n // (segments * block)) * block
 
 
 def count_segments(sizes: list, segments: int, block: int = 1) -> int:
-    """How many segments leaves of these sizes are cut into, at most `segments`."""
+    """Number of segments, at most `segments`, into which leaves of these sizes are cut."""
     return max(-(-n // _length(n, segments, block)) for n in sizes if n)
 
 
 def uncertainty(
     J: Real, r: Real, bend: Real, present: Real, sizes: list, segments: int, tau: Real, block: int = 1
 ) -> Uncertainty:
-    """All of the above.
+    """The `Uncertainty` of an estimate, by the formulas above.
 
     Args:
-        J, r: (m + k, p), (m + k,), in units of parameters; the last k rows are priors, and missing rows are zero. With
-            a loss, r is psi.
+        J, r: (m + k, p), (m + k,), Jacobian in units of the parameters, and residual. The last k rows are priors.
+            Missing rows are zero. With a loss, r is psi.
         bend: psi', (m + k,); None for 1.
-        present: number of rows that are not missing, priors among them.
-        sizes: of the raveled residual leaves, m together. Each is cut into equal parts, and the k-th parts of all
-            leaves, which belong to the same times, are one segment; `segments` of them, by `count_segments`.
-        tau: of `variance_inflation`.
-        block: how many rows stay together, such as those of a record.
+        present: number of rows that are not missing, priors included.
+        sizes: sizes of the raveled residual leaves, m in total. Each leaf is cut into equal parts. The i-th parts of
+            all leaves belong to the same times and form one segment.
+        segments: number of segments, from `count_segments`.
+        tau: from `variance_inflation`.
+        block: number of rows that stay together, such as those of a record.
     """
     xp, p, m = namespace_of(J), J.shape[1], sum(sizes)
     eps = float(jnp.finfo(J.dtype).eps)
@@ -123,7 +127,7 @@ def uncertainty(
     J = J @ (T / column[:, None])
     inverse, flat = _inverse_curvature(J, bend, T, seen)
     undetermined = xp.any(~seen[:, None] & (xp.abs(Vt) > 1e-6), axis=0) | flat | (present == p)
-    told = xp.sum(J[m:] ** 2, axis=1)  # share of a parameter that a prior tells, and residuals do not
+    told = xp.sum(J[m:] ** 2, axis=1)  # share of the information on a parameter that comes from its prior
     prior = J[m:].T @ J[m:]
     J, r = J[:m], r[:m]
     spare = (present - p).astype(J.dtype) - xp.sum(xp.where(told > 0, 1 - told, 0))
@@ -148,7 +152,7 @@ def uncertainty(
 
 
 def _inverse_curvature(J: Real, bend: Real, T: Real, seen: Real):
-    """(J^T diag(bend) J)^-1 for J^T J = 1, and whether a parameter is part of a direction in which it vanishes."""
+    """(J^T diag(bend) J)^-1 for J^T J = 1, and which parameters are part of a direction without curvature."""
     xp, p = namespace_of(J), len(seen)
     if bend is None:
         return xp.eye(p, dtype=J.dtype), xp.zeros(p, bool)
@@ -160,7 +164,7 @@ def _inverse_curvature(J: Real, bend: Real, T: Real, seen: Real):
 
 
 def in_segments(x: Real, sizes: list, segments: int, block: int = 1):
-    """Of each leaf in the rows of x, raveled, its equal parts: (segments, rows, ...), the last filled up with zeros."""
+    """Cuts each raveled leaf in the rows of x into equal parts: (segments, rows, ...), zeros at the end."""
     xp, parts = namespace_of(x), []
     for leaf in xp.split(x, np.cumsum(sizes)[:-1]):
         if n := len(leaf):
@@ -171,8 +175,10 @@ def in_segments(x: Real, sizes: list, segments: int, block: int = 1):
 
 
 def _clusters(J: Real, r: Real, cut: tuple, variance: Real, x: Real, prior: Real):
-    """sum_g s_g s_g^T, for J^T J = 1: then J_g^T (1 - J_g J_g^T)^(-1/2) = (1 - A)^(-1/2) J_g^T with A = J_g^T J_g; and
-    the `_degrees` of its products with the columns of x."""
+    """sum_g s_g s_g^T for J^T J = 1, and the `_degrees` of its products with the columns of x.
+
+    With A = J_g^T J_g, J_g^T (1 - J_g J_g^T)^(-1/2) = (1 - A)^(-1/2) J_g^T.
+    """
     xp, A, score = namespace_of(J), 0.0, 0.0
     for rows, r_rows in zip(*(in_segments(y, *cut) for y in (J, r)), strict=True):
         A = A + xp.einsum("glp,glq->gpq", rows, rows)
@@ -190,8 +196,8 @@ def _clusters(J: Real, r: Real, cut: tuple, variance: Real, x: Real, prior: Real
 def _degrees(share: Real, U: Real, x: Real, known: Real) -> Real:
     """2 mean^2/variance of x^T S x, for each column x and white residuals of unit variance (Bell and McCaffrey 2002).
 
-    It is e^T G e, with G_gh = x^T B_g A_g (delta_gh - A_h) B_h x and B = (1 - A)^(-1/2). known: what is in the mean
-    beside it.
+    x^T S x is e^T G e, with G_gh = x^T B_g A_g (delta_gh - A_h) B_h x and B = (1 - A)^(-1/2). known: the part of the
+    mean that is not from S.
     """
     xp = namespace_of(x)
     y = xp.einsum("gpk,pj->gkj", U, x)
@@ -206,14 +212,16 @@ def _degrees(share: Real, U: Real, x: Real, known: Real) -> Real:
 
 
 def time_axis(shape: tuple, of_records: bool = False) -> int:
-    """The longest axis, along which residuals follow one another; records, on the first axis, do not."""
+    """The axis of time: the longest one. With of_records, the first axis holds records and does not count."""
     first = int(of_records and len(shape) > 1)
     return first + int(np.argmax(shape[first:])) if shape else 0
 
 
 def in_time(shapes: Sequence) -> np.ndarray:
-    """The order of the entries of raveled leaves in which each leaf goes along its `time_axis` first: segments are cut
-    from what follows one another, and not from one output after the other."""
+    """An order of the entries of raveled leaves in which time varies slowest within each leaf.
+
+    So a segment holds all outputs at consecutive times, and not one output after the other.
+    """
     begin, orders = 0, [np.arange(0)]
     for shape in shapes:
         entries = begin + np.arange(math.prod(shape)).reshape(shape)

@@ -1,4 +1,4 @@
-"""Sensors: what they show of a motion, at times of their own, with gain, offset, drift and delay."""
+"""Sensors: their readings along a motion, at times of their own, with gain, offset, drift and delay."""
 
 from __future__ import annotations
 
@@ -38,37 +38,38 @@ def measure(
     output: Callable | None = None,
     params: PyTree = None,
 ) -> Any:
-    """What sensors show at `times`, on their clocks:
+    """Readings of sensors at `times` of their own clocks:
 
         y(t) = gain s(t - delay) + offset + drift (t - t0)
 
-    s is the position q; or `output`, a function of the motion; or, of a run with `output=`, what that has saved, by
-    straight lines. Before the start of the run, at t0, s is what it is there.
+    The signal s is the position q, or `output`, a function of the motion. If the run was made with `output=`, s is its
+    saved output, with straight lines between the saved times. Before the start t0 of the run, s has its value at t0.
 
-    gain, offset, drift and delay are ordinary parameters of a fit: of a signal's gain and a model's stiffness and mass
-    only ratios can be found. Sensors that differ in them, or have clocks of their own, are entries of a dict: each of
-    `times`, gain, offset, drift and delay may be one for all, or a dict of one for each, as for the axes of `jax.vmap`.
+    gain, offset, drift and delay can be parameters of a fit. A gain, a stiffness and a mass cannot all be fitted: the
+    data determine only their ratios. Several sensors are entries of a dict that `output` returns. Each of `times`,
+    gain, offset, drift and delay may be one value for all sensors, or a dict with one for each, as for the axes of
+    `jax.vmap`.
 
     Args:
-        solution: of one run.
-        times: (samples,), s, not after its end; or one for each sensor.
-        gain, offset, drift: numbers, or arrays of the shape of a sensor's reading; drift per second.
-        delay: s, numbers.
+        solution: the solution of one run.
+        times: (samples,), s, not after the end of the run; or one such array for each sensor.
+        gain, offset, drift: numbers, or arrays with the shape of a sensor's reading; drift per second.
+        delay: numbers, s.
         output: a function of some of q, v, w (the acceleration), L (multipliers), z, zdot, friction, sticking, t and
             params, by these names: `output(q, w, params)`, `output(q, v, w, L, z, t, params)`. It returns any pytree.
-            What a system does not have is None. See `accelerometer`. What lies between the saved times is that of
-            `interpolate`; numbers in params that events switch are those that are given here.
-        params: what `output` gets, such as the params of the run.
+            Arguments that the system does not have are None. Values between the saved times are those of `interpolate`.
+            If events switch numbers in params, `output` still gets the params given here. See `accelerometer`.
+        params: passed to `output`, usually the params of the run.
 
     Returns:
-        A pytree like q, or like what `output` returns, with a leading axis of samples.
+        A pytree like q, or like the result of `output`, with a leading axis of samples.
 
     Raises:
-        TypeError, ValueError: as `interpolate`; an `output` of other arguments; a tree that does not fit what is
-            measured.
+        TypeError, ValueError: as `interpolate`; an `output` with other arguments; a dict that does not match the
+            sensors.
 
-    Example: a falling ball, by a tape and by an accelerometer with a clock of its own, which is late by .3 s. In free
-    fall it shows nothing but its offset:
+    Example: a falling ball, measured with a tape and with an accelerometer whose clock is late by 0.3 s. In free fall
+    the accelerometer shows only its offset:
 
     >>> import jax.numpy as jnp, hhtjax
     >>> ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: 0 * q - params["g"])
@@ -82,10 +83,10 @@ def measure(
     ([-0.72625, -3.905], [0.02, 0.02, 0.02])
     """
     if not isinstance(solution, Solution):
-        raise TypeError(f"measure: `solution` must be what simulate returns; received {type(solution).__name__}.")
+        raise TypeError(f"measure: `solution` must be a Solution, from simulate; received {type(solution).__name__}.")
     output = require_output("measure", output)
     if output is not None and solution.output is not None:
-        raise ValueError("measure: leave `output` out: the run was made with one, and has kept nothing else.")
+        raise ValueError("measure: `output` must be left out: the run was made with output=, and saved nothing else.")
     sense = partial(_sensed, solution, output, require_params("measure", params))
     times, delay = _one_or_tree(times), _one_or_tree(delay)
     t0 = solution.t[0]
@@ -106,13 +107,13 @@ def measure(
 
 
 def _clock(times, delay, t0) -> Array:
-    """The times at which is measured what is shown at these."""
+    """The times of the motion for readings at these times: earlier by the delay, and not before the start."""
     require_number("measure", "delay", delay, np.isfinite, "be finite")
     return jnp.maximum(jnp.asarray(times) - delay, t0)
 
 
 def _sensed(solution: Solution, output: Output | None, params: PyTree, times: Array) -> PyTree:
-    """What ideal sensors show, with the times as leading axes."""
+    """Readings of ideal sensors, with the times as leading axes."""
     found = interpolate(solution, times)
     if output is None:
         return found.q if solution.output is None else found.output
@@ -121,7 +122,7 @@ def _sensed(solution: Solution, output: Output | None, params: PyTree, times: Ar
 
 @Programs
 def _outputs(output: Output, found: Interpolant, times: Array, params: PyTree) -> PyTree:
-    """The output at each of the times, what is known there being `found`."""
+    """The output at each of the times. found: the interpolated motion there."""
     params = thaw(params)
     one = partial(output_at, output)
     for _ in range(times.ndim):
@@ -130,7 +131,7 @@ def _outputs(output: Output, found: Interpolant, times: Array, params: PyTree) -
 
 
 def _one_or_tree(x: PyTree):
-    """Numbers in a list as an array."""
+    """A list of numbers as an array; anything else unchanged."""
     return np.asarray(x) if isinstance(x, (list, tuple)) and all(is_real(y) and np.ndim(y) == 0 for y in x) else x
 
 
@@ -139,7 +140,7 @@ def _is_tree(x: PyTree) -> bool:
 
 
 def _each(name: str, x: PyTree, like: PyTree):
-    """One for each leaf of what is measured, from one for all or for whole parts of it."""
+    """A list with one x for each leaf of the readings, from one x for all, or for whole branches."""
     try:
         return jax.tree.leaves(jax.tree.map(lambda x, part: [x] * len(jax.tree.leaves(part)), x, like))
     except (ValueError, TypeError):
@@ -150,7 +151,7 @@ def _each(name: str, x: PyTree, like: PyTree):
 
 
 def _with_flaws(y: Array, since: Array, gain: Real, offset: Real, drift: Real) -> Array:
-    """gain y + offset + drift t, each a number or of the shape of a reading; flags and counts as they are."""
+    """gain y + offset + drift t, each a number or of the shape of a reading. Flags and counts are unchanged."""
     if not jnp.issubdtype(y.dtype, jnp.floating):
         return y
 
@@ -164,7 +165,7 @@ def _with_flaws(y: Array, since: Array, gain: Real, offset: Real, drift: Real) -
 
 @dataclass(frozen=True, eq=False)
 class Accelerometer(Description):
-    """The output of an accelerometer; made by `accelerometer`."""
+    """An accelerometer as an `output` function, made by `accelerometer`."""
 
     position: Any
     gravity: Any
@@ -198,32 +199,31 @@ class Accelerometer(Description):
 
 
 def accelerometer(position: Real, gravity: Real, frame: str | None = None) -> Accelerometer:
-    """What an accelerometer shows, for the `output` of `measure`, `simulate` and `sweep`:
+    """An accelerometer, as the `output` of `measure`, `simulate` and `sweep`:
 
         f = R^T (a - g),    a = d^2/dt^2 position(q(t), t)
 
-    the acceleration less that of gravity (the proper acceleration, or specific force), in the axes of the sensor. In
-    free fall it is zero, and at rest it points up. a is found from q, v and w by derivatives of `position` along the
-    motion, so that the place on a body, its centripetal acceleration and a moving support are in it.
+    The reading f is the acceleration minus that of gravity, in the axes of the sensor (proper acceleration, or specific
+    force). In free fall it is zero. At rest it points up. a is computed from q, v and w by derivatives of `position`
+    along the motion. It includes the centripetal acceleration of a point on a body, and the motion of a support.
 
     Args:
-        position: where the sensor sits, `position(q, t, params)` -> (d,), m, in axes at rest; d is 1, 2 or 3.
+        position: position of the sensor, `position(q, t, params)` -> (d,), m, in axes at rest; d is 1, 2 or 3.
         gravity: (d,), the acceleration of free fall, m/s^2, such as (0, 0, -9.81); or a function `gravity(params)`.
-        frame: the axes of the sensor, `frame(q, t, params)` -> (d, d), a rotation whose columns they are; of a body
-            with the rotation R that is R itself. Default: axes at rest.
+        frame: axes of the sensor, `frame(q, t, params)` -> (d, d), a rotation matrix with the axes as columns. If the
+            sensor is aligned with a body, this is the rotation R of the body. Default: axes at rest.
 
     Returns:
-        A function (q, v, w, t, params) -> (d,). Make it once: functions are known by identity, and another one is
-        compiled anew.
+        A function (q, v, w, t, params) -> (d,). Create it once: another function, even an equal one, is compiled again.
 
     Raises:
-        TypeError: what is no function of these arguments.
-        ValueError: shapes that do not fit, when it is first called.
+        TypeError: position, frame or gravity is not a function of these arguments.
+        ValueError: shapes that do not match, when the returned function is first called.
 
     References:
         Titterton, Weston, Strapdown Inertial Navigation Technology (2004), Ch. 3; MuJoCo's sensor of that name.
 
-    Example: on the bob of a pendulum, with axes across the rod and along it. At the lowest point it shows g + l v^2.
+    Example: on the bob of a pendulum, with axes across and along the rod. At the lowest point the reading is g + l v^2.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> def position(q, t, params):
@@ -257,13 +257,13 @@ def accelerometer(position: Real, gravity: Real, frame: str | None = None) -> Ac
 
 @shown
 class Windows(NamedTuple):
-    """Windows of measurements, each with its own clock; the last entries of shorter ones repeat, and are not present.
+    """Result of `windows`. Shorter windows are filled up by repeating their last sample, with `present` False.
 
     Attributes:
-        t: (windows, samples), s since the first sample of the window.
-        y: (windows, samples, ...), measured.
-        present: Booleans like y, the weights of `fit`.
-        begin: (windows,), time of the first samples on the clock of the record.
+        t: (windows, samples), time in s since the first sample of the window.
+        y: (windows, samples, ...), measured values.
+        present: Booleans like y, to be passed to `fit` as weights.
+        begin: (windows,), time of the first sample of each window on the clock of the record.
     """
 
     t: Array
@@ -273,20 +273,21 @@ class Windows(NamedTuple):
 
 
 def windows(t: Real, y: PyTree, duration: Real, present: Real | None = None) -> Windows:
-    """A record cut into windows of `duration`, one after the other; what is left at the end is dropped.
+    """Cuts a record into consecutive windows of `duration`, for `fit(records=...)`. An incomplete last one is dropped.
 
     Args:
-        t: (samples,), s, increasing; not necessarily uniform: windows follow the clock, and may hold gaps.
-        y: (samples, ...), measured. present: Booleans like y; False where a sample is missing, and may be NaN.
-        duration: of a window, s. The next window begins with the first sample at its end or after it; without a gap
-            there, the two share that sample.
+        t: (samples,), times in s, increasing. They need not be equally spaced: windows have equal duration, and may
+            contain gaps.
+        y: (samples, ...), measured values. present: Booleans like y; False marks a missing sample, which may be NaN.
+        duration: duration of a window, s. The next window begins with the first sample at the end of this one, or after
+            it. Without a gap there, both windows contain that sample.
 
     Returns:
         A `Windows`.
 
     Raises:
-        TypeError, ValueError: unequal lengths; times that do not increase; NaN not declared missing; a record shorter
-            than one window.
+        TypeError, ValueError: unequal lengths; times that do not increase; NaN that is not declared missing; a record
+            shorter than one window.
 
     >>> import numpy as np, hhtjax
     >>> t = np.array([0.0, 0.1, 0.2, 0.45, 0.5, 0.6, 0.8])
@@ -323,13 +324,15 @@ def windows(t: Real, y: PyTree, duration: Real, present: Real | None = None) -> 
 
 
 def wrap_angle(angle: Real) -> Any:
-    """The same angle in [-pi, pi): for the difference of two angles of which one has lost its whole turns.
+    """Maps an angle to [-pi, pi) by adding whole turns.
+
+    Apply it to the difference of two angles if one of them was measured without its whole turns.
 
     Args:
         angle: rad, an array of any shape.
 
     Returns:
-        Shaped like angle.
+        An array shaped like angle.
 
     Raises:
         TypeError: angle is not real.

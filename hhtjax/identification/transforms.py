@@ -1,14 +1,14 @@
-"""Coordinates for fitting: what keeps a parameter positive, inside bounds, or fixed.
+"""Transforms, which keep a parameter positive, inside bounds, or fixed during a fit.
 
-`fit` moves numbers x without limits, and a transform turns them into parameters p, entry by entry:
+`fit` works with unbounded numbers x. A transform maps them to parameters p, entry by entry:
 
     none          p = scale x
     positive      p = exp(x)
-    bounded       p = lower + (upper - lower)/(1 + exp(-x));  of one bound lower + exp(x), or upper - exp(-x)
+    bounded       p = lower + (upper - lower)/(1 + exp(-x));  with one bound: lower + exp(x), or upper - exp(-x)
     fixed         p stays as it is in params0
 
-A step of Levenberg-Marquardt changes the x of a positive or bounded parameter by at most 1: for more, the exponential
-is no straight line.
+A step of Levenberg-Marquardt changes the x of a positive or bounded parameter by at most 1. Over a longer step the
+exponential is too far from a straight line.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ class Transform:
         jax.tree_util.register_static(cls)
 
     def contains(self, p: Real) -> np.ndarray:
-        """Whether the values p can be reached."""
+        """Which of the values p the transform can reach."""
         return np.full(np.shape(p), True)
 
     def parameter(self, x, scale):
-        """p of x; scale: typical size of p, used by the plain transform only."""
+        """The parameter p for x. scale: typical size of p, used only by the transform without bounds."""
         raise NotImplementedError
 
     def coordinate(self, p, scale):
-        """x of p."""
+        """The number x for a parameter p."""
         raise NotImplementedError
 
     def bend(self, x):
-        """p''/p' at x."""
+        """p''/p' at x, the relative curvature of the transform."""
         raise NotImplementedError
 
     def ends(self, dtype: Any = float):
@@ -54,11 +54,11 @@ class Transform:
         return np.asarray(-np.inf, dtype), np.asarray(np.inf, dtype)
 
     def fits(self, shape: tuple) -> bool:
-        """Whether the transform is one of parameters of this shape."""
+        """Whether the transform can be used for parameters of this shape."""
         return True
 
     def distance(self, p: Array) -> Array:
-        """Of p from the nearer bound."""
+        """Distance of p from the nearer bound."""
         lower, upper = self.ends(p.dtype)
         return jnp.minimum(p - lower, upper - p)
 
@@ -89,7 +89,7 @@ class Positive(Transform):
     expectation = "be positive, for its transform"
 
     def ends(self, dtype: Any = float):
-        """0 and none."""
+        """The bounds 0 and inf."""
         return np.asarray(0.0, dtype), np.asarray(np.inf, dtype)
 
     def contains(self, p: Array) -> Real:
@@ -112,14 +112,14 @@ class Positive(Transform):
 
 @dataclass(frozen=True)
 class Bounded(Transform):
-    """p between lower and upper: numbers, or nested tuples like an array, so that they can be hashed; inf for none."""
+    """p between lower and upper. The bounds are numbers, or nested tuples (which are hashable); inf means no bound."""
 
     lower: Any
     upper: Any
 
     @property
     def expectation(self):
-        """Words for an error."""
+        """What an error message says about the values."""
         return f"lie between {self.lower} and {self.upper}, for its transform"
 
     def ends(self, dtype: Any = float):
@@ -128,7 +128,7 @@ class Bounded(Transform):
 
     @property
     def longest_step(self) -> np.ndarray:
-        """1 where there is a bound."""
+        """1 where there is a bound, otherwise inf."""
         lower, upper = self.ends()
         return np.where(np.isfinite(lower) | np.isfinite(upper), 1.0, np.inf)
 
@@ -143,7 +143,7 @@ class Bounded(Transform):
         return (p > lower) & (p < upper)
 
     def parameter(self, x: Array, scale: Real) -> Array:
-        """lower + (upper - lower)/(1 + exp(-x)); of one bound lower + exp(x), or upper - exp(-x); of none scale x."""
+        """lower + (upper - lower)/(1 + exp(-x)); with one bound lower + exp(x) or upper - exp(-x); without, scale x."""
         lower, upper = self.ends(x.dtype)
         has_lower, has_upper = np.isfinite(lower), np.isfinite(upper)
         p = self._between(x, np.where(has_lower, lower, 0), np.where(has_upper, upper, 1))
@@ -172,7 +172,7 @@ class Bounded(Transform):
         return jnp.where(has_lower | has_upper, jnp.log(above / below), p / scale)
 
     def bend(self, x: Array) -> Array:
-        """-tanh(x/2); of one bound 1 or -1; of none 0."""
+        """-tanh(x/2); with one bound 1 or -1; without bounds 0."""
         lower, upper = (np.isfinite(bound) for bound in self.ends())
         one_sided = lower.astype(float) - upper.astype(float)
         return jnp.where(lower & upper, -jnp.tanh(x / 2), one_sided.astype(x.dtype))
@@ -180,7 +180,7 @@ class Bounded(Transform):
 
 @dataclass(frozen=True)
 class Fixed(Transform):
-    """p as it is; not a coordinate at all."""
+    """p is not fitted, and has no coordinate x."""
 
 
 scaled = Scaled()
@@ -189,16 +189,16 @@ fixed = Fixed()
 
 
 def bounded(lower: Real = None, upper: Real = None) -> Bounded:
-    """A transform that keeps a parameter strictly between two bounds, or on one side of one.
+    """A transform that keeps a parameter strictly between two bounds, or on one side of a single bound.
 
     Args:
-        lower, upper: numbers, or arrays of the shape of the parameter; None, -inf or inf where there is no bound.
+        lower, upper: numbers, or arrays with the shape of the parameter; None, -inf or inf where there is no bound.
 
     Returns:
-        What `fit(transforms=...)` takes.
+        A transform for `fit(transforms=...)`.
 
     Raises:
-        TypeError, ValueError: a bound that is not real, or NaN; lower >= upper; no bound at all.
+        TypeError, ValueError: a bound that is not real, or is NaN; lower >= upper; no bound at all.
 
     >>> import hhtjax
     >>> result = hhtjax.fit(lambda p: p - jax.numpy.array([2.0, 3.0]), 0.5, transforms=hhtjax.bounded(0, 1))
@@ -227,7 +227,7 @@ def _bound(name: str, given: PyTree, none: float) -> np.ndarray:
     if bound is None:
         raise TypeError(f"bounded: `{name}` must be a real number, an array of them, or None; received {given!r}.")
     if np.any(np.isnan(bound)) or np.any(bound == -none):
-        raise ValueError(f"bounded: `{name}` must be finite, or {none} for none; received {given}.")
+        raise ValueError(f"bounded: `{name}` must be finite, or {none} for no bound; received {given}.")
     return bound
 
 
@@ -236,7 +236,7 @@ def _hashable(x: PyTree) -> PyTree:
 
 
 def is_transform(x: PyTree) -> bool:
-    """Whether it is one, or None for none."""
+    """Whether x is a transform, or None."""
     return x is None or isinstance(x, Transform)
 
 

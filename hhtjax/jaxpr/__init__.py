@@ -1,33 +1,40 @@
-"""Evaluators of jaxprs: a traced function, run with other values than arrays.
+"""Evaluators of jaxprs: they run a traced function with values other than arrays.
 
-    on_scalars(f, tree)       how to evaluate f, and others, number by number, where that pays
-    linear_map(f, like)       the matrix of a linear map, from what depends on what
+    on_scalars(f, tree)       a way to evaluate f, and other functions of the tree, number by number where that is
+    faster linear_map(f, like)       the matrix of a linear map, computed with its sparsity
     listed(f, *args)          f as a list of operations on scalars, to be written in another language
     dependencies(f, x)        which outputs of f may depend on which inputs, as a sparse matrix
 
 The contract
 ------------
 
-The same program gives the same numbers with and without, to rounding; signed zeros, NaN and infinities included. Two
-licences: inside a sum of products a term with a factor that is zero by structure (a unit vector, a tangent that
-autodiff knows to be zero) may be left out, and the sign of a sum that is zero is rounding (XLA itself takes x + 0 for
-x). And in reverse mode such a zero becomes a number where a stage ends, as where a scan does: beside an infinite
-derivative, that of 1/x at zero, it makes NaN where plain JAX may have infinity. A rule names the parameters of its
-operation that it understands; what it does not understand runs on whole arrays. So a JAX that brings a new operation,
-or a new option of an old one, makes programs slower, and never wrong.
+A program gives the same numbers with and without these evaluators, to rounding. This includes signed zeros, NaN and
+infinities, with three exceptions:
 
-A rule for an operation
------------------------
+* In a sum of products, a term with a structural zero as a factor (an entry of a unit vector, or a tangent that autodiff
+  knows to be zero) may be left out.
+* The sign of a sum that is zero may differ. (XLA itself replaces x + 0 by x.)
+* In reverse mode a structural zero becomes an ordinary one at the end of a stage or a scan. Multiplied by an infinite
+  derivative, that of 1/x at zero, it gives NaN where plain JAX may give infinity.
 
-An operation (a primitive of JAX) that has no rule runs on whole arrays, and ends a kernel if XLA cannot fuse it: so
-add one only where `explain` names it in a program that matters. In `scalar_rules.py` the table `UNDERSTOOD` states
-the parameters and the values that the rule understands; there is the rule itself, too, a function of the operation
-and of arrays in pieces that returns the pieces of the results, or None for whole arrays. `linear_maps.py` has what is
-needed to know which result depends on which unknown. Then put expressions with all its options into
-`tests/operations_table.py`: `tests/test_conformance.py` compares values, forward and reverse derivatives and batches
-with those of plain JAX, with NaN, infinities, signed zeros, integers and empty arrays, and fails for a rule without
-an entry. Random programs of all operations are compared by `python tests/programs.py`, and `tests/test_kernels.py`
-looks at what XLA compiled.
+Each rule lists the parameters of its operation that it supports. All other cases run on whole arrays. So a new
+operation of JAX, or a new option of an old one, makes programs slower, but never wrong.
+
+Adding a rule for an operation
+------------------------------
+
+An operation (a primitive of JAX) without a rule runs on whole arrays. It ends a kernel if XLA cannot fuse it. So add a
+rule only if `explain` names the operation in a program that matters.
+
+1. Write the rule in `scalar_rules.py`: a function of the operation and of arrays in pieces. It returns the pieces of
+the
+   results, or None to use whole arrays. In the table `UNDERSTOOD` list the parameters and values that it supports.
+2. In `linear_maps.py` add how its results depend on the unknowns.
+3. Add expressions with all options of the operation to `tests/operations_table.py`. `tests/test_conformance.py`
+compares
+   values, forward and reverse derivatives and batches with plain JAX, with NaN, infinities, signed zeros, integers and
+   empty arrays. It fails for a rule without an entry. `python tests/programs.py` compares random programs of all
+   operations. `tests/test_kernels.py` checks what XLA has compiled.
 """
 
 from hhtjax.jaxpr.dependencies import dependencies as dependencies

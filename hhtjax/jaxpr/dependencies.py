@@ -1,13 +1,13 @@
 """The sparsity pattern of a Jacobian, from the program: which outputs may depend on which inputs.
 
-Every array of the program carries, for each of its elements, the set of inputs that it may depend on: the rows of a
-sparse boolean matrix. One operation makes these of its results from those of its operands, as `dependency_rules.py`
-says; functions, branches and loops are here. The sets are true for all values of the inputs: both branches of `where`
-count, and an index that is computed from an input may be any.
+For each element of every array, the set of inputs on which it may depend is a row of a sparse boolean matrix.
+`dependency_rules.py` gives the rows of the results of an operation from those of its operands. Functions, branches and
+loops are handled here. The sets hold for all values of the inputs. So both branches of `where` count, and an index that
+is computed from an input may have any value.
 
-A loop is a relation between its carry before and after a step. What the carry may depend on after any number of steps
-is the smallest solution of an equation of sets. Its body is evaluated once for that, with a row for each element of
-the carry.
+A loop is a relation between its carry before and after a step. The set on which the carry may depend after any number
+of steps is the smallest solution of an equation for sets. To find it, the body is evaluated once, with a row for each
+element of the carry.
 """
 
 from __future__ import annotations
@@ -63,12 +63,11 @@ INSIDE = {  # parameter of an operation that holds a function of all its operand
 def dependencies(f: Callable, x, *others: PyTree):
     """Which outputs of f may depend on which inputs: a superset of the nonzeros of its Jacobian, for all values.
 
-    Entry (i, j) is False only where df_i/dx_j = 0 for every x. The superset is exact for functions made of
-    elementwise operations, of those that move elements, of sums, of products with constant matrices, and of reading and
-    writing at constant indices; `vmap` of such functions, loops of them, and functions with derivatives of their own
-    too. Terms that cancel are not seen: of x - x an entry stays. An operation that is not known takes each of its
-    results for dependent on all of its operands. Zero numbers that f closes over count as zero for ever: hand over as
-    `others` what may change.
+    Entry (i, j) is False only if df_i/dx_j = 0 for every x. The pattern is exact for functions made of elementwise
+    operations, operations that move elements, sums, products with constant matrices, and reading and writing at
+    constant indices. It is also exact for `vmap` and loops of such functions, and for functions with derivatives of
+    their own. Cancelling terms are not detected: x - x gives an entry. For an unknown operation each result counts as
+    dependent on all operands. Zeros that f closes over count as zero for ever: pass arrays that may change as `others`.
 
     Args:
         f: a function (n,), *others -> (m,), as JAX can trace it.
@@ -76,12 +75,12 @@ def dependencies(f: Callable, x, *others: PyTree):
         *others: pytrees of arrays, or of their shapes; their values do not matter either.
 
     Returns:
-        A `scipy.sparse.csr_array` of booleans, (m, n), with sorted indices. It takes about as long as it takes to trace
-        f, and 0.1 ms for each operation and 1e4 entries.
+        A `scipy.sparse.csr_array` of Booleans, (m, n), with sorted indices. It takes about as long as tracing f, plus
+        0.1 ms for each operation and 1e4 entries.
 
     Raises:
-        TypeError: x is no floating vector, or f returns no vector.
-        TooDense: a pattern on the way has more than 1e8 entries.
+        TypeError: x is not a floating vector, or f does not return a vector.
+        TooDense: an intermediate pattern has more than 1e8 entries.
         NotImplementedError: f writes into references (`jax.new_ref`).
 
     >>> import jax.numpy as jnp
@@ -108,7 +107,7 @@ def dependencies(f: Callable, x, *others: PyTree):
 
 
 def run(closed: ClosedJaxpr, values: Sequence[Value]) -> list[Value]:
-    """The values of the results of a jaxpr; each is forgotten where it is used for the last time."""
+    """The values of the results of a jaxpr. Intermediate values are deleted after their last use."""
     jaxpr, constants = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())
     found = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(_constant, constants), *values], strict=True))
     equations = needed(jaxpr)
@@ -261,7 +260,7 @@ def _cond(eqn, which: Value, *values: Value):
 
 
 def _independent(values: Sequence[Value], moves: Sequence[bool]) -> list[Value]:
-    """The same values with elements of those that move for unknowns, in their order."""
+    """The same values, with the elements of those that depend on the inputs as new unknowns, in their order."""
     n, start, found = sum(x.size for x, m in zip(values, moves, strict=True) if m), 0, []
     for x, move in zip(values, moves, strict=True):
         found.append(Value(x.shape, identity(x.size, n, start) if x.size else None) if move else x)
@@ -349,7 +348,7 @@ def _map(eqn, constants: Sequence[Value], rows: Sequence[Value]):
 
 
 def _written_out(eqn, constants: Sequence[Value], carry: Sequence[Value], rows: Sequence[Value]):
-    """Step by step, with all that is known in each."""
+    """A loop evaluated step by step, using the known numbers of each step."""
     found, count = {}, len(carry)
     steps = range(eqn.params["length"])
     for i in reversed(steps) if eqn.params["reverse"] else steps:
@@ -361,7 +360,7 @@ def _written_out(eqn, constants: Sequence[Value], carry: Sequence[Value], rows: 
 
 
 def _by_relation(eqn, constants: Sequence[Value], carry: Sequence[Value], rows: Sequence[Value]):
-    """All steps at once, by the relation of one."""
+    """A loop evaluated for all steps at once, from the relation of one step."""
     closed, count, length = eqn.params["jaxpr"], len(carry), eqn.params["length"]
     given = closed.jaxpr.invars[len(constants) :]
     moves = [[x.rows is not None for x in constants], _floating(given[:count]), [x.rows is not None for x in rows]]

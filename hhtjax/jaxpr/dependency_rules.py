@@ -1,8 +1,8 @@
-"""What the results of an operation depend on, where elements are told apart: a rule for each operation of JAX.
+"""Which elements of the results of an operation depend on which elements of its operands: a rule for each operation.
 
-A rule is a function (operation, *values) -> values of its results. It may take for dependent what is not, and never the
-reverse. An operation without a rule, or an option that a rule does not know, makes each result depend on all that any
-operand does (`all_on_all`).
+A rule is a function (operation, *values) -> values of its results. It may report a dependence that does not exist, but
+must not miss one. For an operation without a rule, or with an option that its rule does not support, each result
+depends on everything on which any operand depends (`all_on_all`).
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def _add(eqn, x: Value, y: Value):
 
 
 def _mul(eqn, x: Value, y: Value):
-    """x y, which does not depend on x where y is zero."""
+    """x y. It does not depend on x where y is zero."""
     shape = out_shape(eqn)
     masks = _fit_mask(x, shape), _fit_mask(y, shape)
     rows = united(only(_fit(x, shape), masks[1]), only(_fit(y, shape), masks[0]))
@@ -131,7 +131,7 @@ def _same(eqn, *values: Value):
 
 
 def _moved(eqn, *values: Value):
-    """What the operation does with the numbers of elements, and with what is known of them."""
+    """Applies an operation that moves elements to the numbers of the elements, and to what is known of them."""
     move = MOVES[eqn.primitive.name]
     there = [x for x in values if x.rows is not None]
     rows: list = [None] * len(eqn.outvars)
@@ -185,7 +185,7 @@ def _cumulative(eqn, x: Value):
 
 
 def _along(eqn, axis: int, *values: Value):
-    """Each result anything along this axis of its operand, as of sorted arrays."""
+    """Each result depends on all elements of its operand along this axis, as in sorting."""
     found = []
     for x, out in zip(values, eqn.outvars, strict=False):
         shape = tuple(out.aval.shape)

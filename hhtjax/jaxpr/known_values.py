@@ -1,6 +1,6 @@
-"""Operations on NumPy arrays: those that move elements, of whatever these are, and those of numbers that are known.
+"""Operations on NumPy arrays: those that move elements of any type, and those on known numbers.
 
-XLA would compile each of them, which takes longer than most of these arrays are worth.
+XLA would compile each of them. For most of these small arrays that takes longer than computing them with NumPy.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
-"""The matrix of a linear map, from one evaluation that keeps track of what depends on which unknown.
+"""The matrix of a linear map, from one evaluation that uses its sparsity.
 
-With n unit vectors, the matrix takes n times the work of the map. But most of a mechanical system couples nothing:
-sines of angles, products with masses and velocities. There element i depends on unknown i alone, and n numbers say
-what n^2 would. Springs between neighbours depend on unknowns i and i + 1, sums of differences on two of n; and a
-product with a matrix, A diag(d), is a scaling of its columns.
+With n unit vectors, computing the matrix takes n times the work of the map. But most operations of a mechanical system
+do not couple unknowns: sines of angles, products with masses and velocities. Element i then depends only on unknown i,
+and n numbers suffice instead of n^2. Springs between neighbours depend on unknowns i and i + 1, sums of differences on
+two of n. A product with a matrix, A diag(d), is a scaling of its columns.
 
-So every value carries `Terms`: for each axis of it, the parts of its derivative where the unknown is told by the index
-along that axis, or else one full array. Operations that have no rule here run on whole columns, as with vmap.
+So the derivative of every value is stored as `Terms`. For each axis of the value, they have the parts of the derivative
+in which the index along that axis determines the unknown. All other parts are one full array. Operations without a rule
+here run on whole columns, as with vmap.
 """
 
 from __future__ import annotations
@@ -291,10 +292,10 @@ MOST_TERMS = 4  # beyond, a full array is no more work
 
 @dataclass
 class Terms:
-    """dy/dx of an array y of this shape with respect to n unknowns x: the sum over (axis, offset) of
+    """The derivative dy/dx of an array y of this shape by n unknowns x. It is the sum over all (axis, offset) of
 
     dy[index]/dx[k] = along[axis, offset][index] where k = index[axis] + offset, and zero elsewhere;
-    and dy[index]/dx[k] = full[k, index].
+    plus dy[index]/dx[k] = full[k, index].
     """
 
     n: int

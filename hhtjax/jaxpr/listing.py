@@ -1,11 +1,11 @@
-"""A program as a list of operations on scalars, for who writes it in another language.
+"""A program as a list of operations on scalars, to be written in another language.
 
-An operand is a `Scalar`, or a known number. Three operations hold lists of their own: `cond` one for each branch,
-`while` its condition and its body, whose carried variables are its results. Others make and read small arrays, whose
-name is a `Scalar` too: `array` of its elements, `element` of an array at an index, `lu`, `svd` and `triangular_solve`;
-`taken` has elements of an array in another order, `map` does one operation on all, and `product` multiplies matrices.
-Where it is asked for, a linear solve is an operation `solve` on its right-hand side, whose results are the unknowns,
-with a list that makes the left-hand side of these.
+An operand is a `Scalar`, or a known number. Two kinds of operations contain lists of their own: `cond` has one for each
+branch; `while` has its condition and its body, and its results are the carried variables. Other operations make and
+read small arrays, each named by a `Scalar` too: `array` (from elements), `element` (of an array at an index), `lu`,
+`svd`, `triangular_solve`, `taken` (elements in another order), `map` (one operation on all elements), and `product` (of
+matrices). On request a linear solve is an operation `solve`. Its operand is the right-hand side, and its results are
+the unknowns. It contains a list that computes the left-hand side from the unknowns.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ COSTLY = {"lu", "svd", "triangular_solve"}
 
 @dataclass(eq=False)
 class Scalar:
-    """A number that is not known yet, or the name of an array of `size` of them."""
+    """A number that is not known yet, or the name of an array of `size` numbers."""
 
     dtype: Any
     recorder: Any  # that made it
@@ -55,15 +55,19 @@ class Operation:
 
 @dataclass(frozen=True)
 class Listing:
-    """A function as a list. arguments: its scalars, one for each number; results: a tree with operands for numbers."""
+    """A function as a list of operations.
+
+    arguments: a scalar for each number of its arguments. results: a pytree with operands instead of numbers.
+    """
 
     arguments: list
     operations: list
     results: Any
 
     def apart(self, constant: list):
-        """Factors of matrices that follow from the arguments `constant` alone, for who computes them once: the names of
-        their arrays, the operations that give them, and the listing that has them as arguments too."""
+        """Separates the factors of matrices that depend only on the arguments `constant`, so that they can be kept.
+
+        Returns the names of their arrays, the operations that compute them, and the listing with them as arguments."""
         known, found = set(constant), []
         for x in self.operations:
             if not x.blocks and known.issuperset(_scalars(x.operands)):

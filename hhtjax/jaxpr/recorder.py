@@ -1,4 +1,4 @@
-"""What writes the list of `listing.py`: each operation once, and none whose result is known."""
+"""Writes the list of `listing.py`: each operation once, and none whose result is known."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SAME = {"add_any": "add", "stop_gradient": "copy"}
 
 
 class Recorder:
-    """The list so far: of the function, and of the branches and loops inside which we are."""
+    """The list so far: that of the function, and those of the branches and loops that are being recorded."""
 
     def __init__(self):
         self.blocks, self.known = [Block()], [{}]

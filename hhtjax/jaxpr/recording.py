@@ -1,7 +1,7 @@
-"""A function, traced and written as a list of operations on scalars: arrays of any size taken to pieces.
+"""Converts a traced function into a list of operations on scalars. Arrays of any size are taken apart.
 
-Rules of `scalar_rules.py` move elements, and tell what is done with them; here are calls, branches, loops, and what
-reads an array at an index that is not known. No derivative is taken of the list: what it holds is final.
+The rules of `scalar_rules.py` handle operations that move elements or compute with them. Calls, branches, loops, and
+reads of an array at an unknown index are handled here. The list is final: no derivative is taken of it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ INLINED = {  # a function called: the parameter that holds it
 
 
 class NotListed(Exception):
-    """An operation that cannot be in the list. name: its; line: of the user's that asked for it, or None."""
+    """An operation that cannot be listed. name: its name. line: the user's source line that needs it, or None."""
 
     def __init__(self, name: str, line=None):
         super().__init__(name if line is None else f"{name} ({line})")
@@ -53,18 +53,18 @@ class NotListed(Exception):
 
 
 def listed(f: Callable, *args: PyTree, whole: bool = False) -> Listing:
-    """f as a list of operations on scalars, with a scalar for each number of its arguments.
+    """Lists f as operations on scalars, with a scalar for each number of its arguments.
 
     Args:
-        f: a function of pytrees of arrays, to one.
-        *args: these; shapes and types matter, values do not.
-        whole: whether linear solves, and sines by polynomials, stay operations.
+        f: a function of pytrees of arrays that returns a pytree of arrays.
+        *args: its arguments. Only their shapes and types matter.
+        whole: whether linear solves, and sines by polynomials, stay single operations.
 
     Returns:
-        A `Listing`; its results are the tree that f returns, with object arrays of operands.
+        A `Listing`. Its results are the pytree that f returns, with object arrays of operands.
 
     Raises:
-        NotListed: with the name of an operation that it does not know, and where it comes from.
+        NotListed: an operation is not supported. It has the name of the operation and its source line.
 
     >>> import jax.numpy as jnp
     >>> found = listed(lambda x: 2 * jnp.sin(x), jnp.ones(3))
@@ -231,7 +231,7 @@ def kept_and_carried(params: PyTree):
 
 
 def _counted(listing, params: PyTree, constants: tuple, start: tuple, avals: list):
-    """The same steps again and again as a `while` that counts them; None where that spares little."""
+    """Repeated equal steps as a `while` with a counter; None if that saves little."""
     recorder, carry = listing.recorder, [_fresh(listing.recorder, x) for x in avals]
     body = recorder.inside(lambda: _flat(listing.run(params["jaxpr"], [*constants, *carry])))
     if (params["length"] - 1) * sum(1 for _ in everywhere(body.operations)) <= WRITTEN_OUT:
@@ -305,7 +305,7 @@ def _map(recorder: Recorder, name: str, out, values: list):
 
 
 def _operand(recorder, x: np.ndarray):
-    """The one number that an array holds, or its name; None of what has neither."""
+    """The single number that an array holds, or its name; None if it has neither."""
     first = x.flat[0]
     if all(y.tobytes() == first.tobytes() if is_known(y) and is_known(first) else y is first for y in x.flat):
         return as_operand(first)
@@ -496,7 +496,7 @@ def _permutation(recorder, eqn, pivots):
 
 
 def _moved(recorder: Recorder, eqn: JaxprEqn, *values: np.ndarray):
-    """Of what moves elements, and does nothing else: asked where it takes their numbers."""
+    """The rule of an operation that only moves elements. It is applied to the numbers of the elements."""
     sizes = np.cumsum([0, *(x.size for x in values)])
     numbers = [np.arange(i, i + x.size, dtype=np.int32).reshape(x.shape) for i, x in zip(sizes, values, strict=False)]
     elements = np.concatenate([x.ravel() for x in values])
@@ -522,7 +522,7 @@ def _triangular_solve(recorder, eqn, A: np.ndarray, b: np.ndarray):
 
 
 def _compared(recorder, eqn, x, y):
-    """In the order in which what is no number comes last."""
+    """Comparison in the order in which NaN comes last."""
     pairs = zip(x.flat, y.flat, strict=True)
     return [arranged([recorder.record(eqn.primitive.name, bool, *pair) for pair in pairs], x.shape)]
 

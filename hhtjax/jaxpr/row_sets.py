@@ -1,8 +1,8 @@
-"""Which unknowns each element of an array depends on: a sparse boolean matrix, a row for each element.
+"""Which unknowns each element of an array depends on: a sparse boolean matrix with a row for each element.
 
-A `Value` stands for an array in a program. Its rows tell what it depends on. Beside them it has what is known of its
-numbers: all of them, such as indices that are constants, or where they are zero, such as outside of the band of a
-matrix. Zeros count because 0 y does not depend on y.
+A `Value` represents an array of a program. Its rows show the unknowns on which its elements depend. It also has what is
+known of its numbers: all of them, such as constant indices, or where they are zero, such as outside the band of a
+matrix. Zeros matter because 0 y does not depend on y.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ DIRECTLY = 8  # steps of a closure before its matrix is squared
 
 
 class TooDense(Exception):
-    """A pattern with more entries than is sensible; a dense Jacobian is then no larger."""
+    """A pattern has so many entries that a dense Jacobian would not be larger."""
 
 
 @dataclass
@@ -108,7 +108,7 @@ def united(*parts):
 
 
 def grouped(rows, to: np.ndarray, size: int):
-    """So many rows: the union of those that go there; to: for each row its new number, -1 for none."""
+    """`size` rows, each the union of the rows that are assigned to it. to: new number of each row, -1 for none."""
     if rows is None:
         return None
     to = to.reshape(-1)
@@ -130,7 +130,7 @@ def related(to: np.ndarray, origin: np.ndarray, rows, size: int):
 
 
 def product(relation, rows):
-    """Of a relation (outputs, elements), and the rows of the elements, those of the outputs."""
+    """The rows of the outputs, from a relation (outputs, elements) and the rows of the elements."""
     from scipy import sparse
 
     if rows is None or relation is None:
@@ -202,7 +202,7 @@ def of_members(values: Sequence[Value]) -> Value:
 
 
 def either(*values: Value) -> Value:
-    """What is one of these, nobody knows which."""
+    """A value that may be any one of these."""
     masks = [where_nonzero(x) for x in values]
     mask = None if any(x is None for x in masks) else np.any([x for x in masks if x is not None], axis=0)
     return Value(values[0].shape, united(*(x.rows for x in values)), nonzero=mask)

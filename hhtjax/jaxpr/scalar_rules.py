@@ -1,7 +1,8 @@
-"""Arithmetic on arrays in pieces.
+"""Arithmetic on arrays that have been taken apart into scalars.
 
-What moves numbers about costs nothing. What is done with numbers is what the program says, IEEE, with the signs of
-zeros, NaN and infinities: only x * 1, x / 1, x - 0 and x + -0 are x. With structural zeros it is less.
+Moving elements costs nothing. Arithmetic follows the program exactly, in IEEE arithmetic with signed zeros, NaN and
+infinities: only x * 1, x / 1, x - 0 and x + -0 are replaced by x. With structural zeros more operations can be left
+    out.
 """
 
 from __future__ import annotations
@@ -121,7 +122,7 @@ def compute(name: str, *x: Array) -> Array:
 
 
 def recorder_of(x: tuple):
-    """Who records what is done with these scalars; None where they are JAX's, or known."""
+    """The recorder of these scalars; None if they are JAX arrays, or known numbers."""
     return next((y.recorder for y in x if isinstance(y, Scalar)), None)
 
 
@@ -484,7 +485,7 @@ def _structural(eqn, x: np.ndarray):
 
 
 def _moved(*moves: int):
-    """Of what moves elements to places that are known: asked where it takes the numbers of the elements.
+    """The rule of an operation that moves elements to known places. It is applied to the numbers of the elements.
 
     The numbers start at 1; what comes from outside an array is the fill value, 0.
     """

@@ -1,11 +1,11 @@
-"""Small arrays as scalars: a function of vectors of a few numbers, evaluated number by number.
+"""Small arrays as scalars: functions of vectors of a few numbers are evaluated number by number.
 
-XLA:CPU runs a loop over each small array, with a branch for every part of a concatenation; and vmap puts members first,
-so that in memory the coordinates of one lie side by side, and no vector instruction fits. A function that is traced,
-and evaluated anew with arrays of scalars in the place of small arrays, is rid of both: to move numbers about costs
-nothing, products with the zeros and ones of unit vectors vanish, and a batch of each scalar is one array without gaps.
+XLA:CPU runs a loop over each small array, with a branch for every part of a concatenation. Under vmap the coordinates
+of one member are next to each other in memory, so that vector instructions cannot be used. Both problems disappear if a
+traced function is evaluated again with scalars instead of small arrays. Then moving numbers costs nothing, products
+with the zeros and ones of unit vectors disappear, and a batch of each scalar is one contiguous array.
 
-It comes before vmap and autodiff, which then see scalars. An operation that has no rule here runs on whole arrays.
+This happens before vmap and autodiff, which then see scalars. An operation without a rule here runs on whole arrays.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ class Scalars:
 
 
 def pays(f: Callable, *args: PyTree, derivatives: bool = True) -> bool:
-    """Whether f of these trees is better evaluated on scalars: few operations, all known, of more than one number.
+    """Whether f of these trees is faster on scalars: few operations, all with rules, on more than one number.
 
-    Operations that are not known may keep XLA from making one kernel of a loop; without one, scalars take longer.
+    Operations without a rule may prevent XLA from making one kernel of a loop. Without that kernel, scalars are slower.
     """
     if jax.default_backend() != "cpu" or not is_on():
         return False
@@ -80,7 +80,7 @@ def _traced(f: Callable, *args: PyTree):
 
 
 def _work(jaxpr):
-    """Number of operations on scalars, infinite with one that is not known; none for what only moves numbers."""
+    """Number of operations on scalars; infinite if one has no rule. Operations that only move numbers do not count."""
     total = 0
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
@@ -125,15 +125,16 @@ class Form(NamedTuple):
 
 
 def on_scalars(f: Callable, tree: PyTree, derivatives: bool = True) -> Form:
-    """The form in which f of the tree is better evaluated: on scalars where that pays, else on arrays.
+    """The form in which f(tree) is evaluated faster: on scalars or on arrays.
 
     Args:
         f: a function of the tree.
         tree: a pytree of arrays.
-        derivatives: whether some may be taken.
+        derivatives: whether derivatives may be taken.
 
     Returns:
-        A `Form`: its `tree` is what f, and others, are evaluated with, and `joined` makes arrays of what they return.
+        A `Form`. Evaluate `form.of(f)`, or other functions of the tree, with its `tree`; `joined` converts the results
+        to arrays.
 
     Raises:
         whatever f raises.
@@ -242,7 +243,7 @@ def in_stages(name: str, f: Callable, *args: Array):
 
 
 def _each_once(jaxpr: Jaxpr):
-    """The operations of a jaxpr without those on numbers that have been done before, and its results."""
+    """The operations of a jaxpr without repeated operations on the same numbers, and its results."""
     eqns, done, same = [], {}, {}
 
     def renamed(atoms: list):

@@ -1,1 +1,1 @@
-"""Mathematics that knows nothing of mechanics: solves, scans, loops whose length is data, extrapolation."""
+"""Numerical methods that do not depend on mechanics: linear solves, scans, loops of variable length, power series."""

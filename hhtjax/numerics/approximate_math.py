@@ -1,6 +1,6 @@
-"""Logarithm and exponential to four digits, for a loop that waits for them: XLA's own would take half of a step.
+"""Fast logarithm and exponential, accurate to four digits or more, for error control: XLA's own would take half a step.
 
-And numbers of few digits, on which programs agree that round differently.
+Also rounding to few digits, so that programs that round differently get the same numbers.
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ def approximate_log(x: Array) -> Array:
 
 
 def approximate_exp(x: Array) -> Array:
-    """exp(x) to 1e-5 of it for x from -2.4 to 0.9; beyond that less than exp(-2.4), or more than exp(0.9).
+    """exp(x), to a relative error of 1e-5 for x from -2.4 to 0.9.
+
+    For smaller x the result is less than exp(-2.4), for larger x more than exp(0.9).
 
     >>> x = jnp.linspace(-2.4, 0.9, 99)
     >>> bool(jnp.all(abs(approximate_exp(x) / np.exp(x) - 1) < 2e-5))
@@ -52,9 +54,9 @@ def approximate_exp(x: Array) -> Array:
 
 
 def without_rounding(x: Array, more: int = 0) -> Array:
-    """x, positive, to the nearest number of 16 binary digits, and `more` units in its last place.
+    """A positive x rounded to the nearest number of 16 binary digits, plus `more` units in its last place.
 
-    Numbers that differ by rounding are mostly one behind it.
+    Two numbers that differ only by rounding usually give the same result.
 
     >>> bool(without_rounding(jnp.asarray(1.3)) == without_rounding(jnp.asarray(1.3) * (1 + jnp.finfo(float).eps)))
     True

@@ -1,8 +1,8 @@
-"""The same algorithm on arrays of JAX, to be compiled, or of NumPy, which need no compilation.
+"""Functions with which an algorithm runs on JAX arrays, which need compilation, or on NumPy arrays, which do not.
 
-A new program costs XLA some 10 ms for every few operations: where an algorithm goes through many small ones, a few
-times, and nothing is being traced, NumPy is done before. Written against the module that `namespace_of` names, and with
-the functions below, it takes either.
+For a new program XLA needs some 10 ms for every few operations. If an algorithm has many small operations, is run a few
+times, and is not traced, NumPy is faster. To support both, an algorithm uses the module that `namespace_of` returns,
+and the functions below.
 """
 
 from __future__ import annotations

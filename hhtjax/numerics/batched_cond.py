@@ -1,4 +1,4 @@
-"""A branch that is seldom taken: a batch takes it where one of its members asks, and pays nothing elsewhere."""
+"""Branches that are seldom taken. A batch takes one only if a member asks for it; otherwise it costs nothing."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ def tree_where(where: Array, x: PyTree, y: PyTree):
 
 
 def call_where(f: Callable, asked: Array, carry: PyTree, *more: PyTree) -> PyTree:
-    """f(carry, *more), of the structure of the carry, where `asked`; else the carry.
+    """f(carry, *more) if `asked`, otherwise the carry. f returns a pytree like the carry.
 
-    Of a plain condition vmap makes a choice between both, for every member and in every step. Members that have not
-    asked go through f too where another one has, but neither its values nor its derivatives reach them.
+    For an ordinary `lax.cond` vmap evaluates both branches, for every member in every step. Here f is evaluated only if
+    a member has asked. It is then evaluated for all members, but its values and derivatives reach only those that
+    asked.
 
     >>> import jax, jax.numpy as jnp
     >>> def root(x):
@@ -36,7 +37,7 @@ def call_where(f: Callable, asked: Array, carry: PyTree, *more: PyTree) -> PyTre
 
 
 def call_where_alone(f: Callable, asked: Array, carry, *more):
-    """The same, one member of a batch after the other, each as it is alone: for what is long, and seldom at one time.
+    """As `call_where`, with the members of a batch evaluated one by one: for a long f that few members need at a time.
 
     >>> import jax, jax.numpy as jnp
     >>> print(jax.vmap(lambda x: call_where_alone(jnp.sqrt, x > 1, x))(jnp.array([4.0, 0.0])))
@@ -46,7 +47,7 @@ def call_where_alone(f: Callable, asked: Array, carry, *more):
 
 
 def _careful(f: Callable, asked: Array):
-    """f, of which only members that have asked see anything."""
+    """f with results that reach only the members that have asked."""
 
     def branch(carry: PyTree, *more: PyTree):
         known = tree_where(asked, (carry, more), lax.stop_gradient((carry, more)))
@@ -56,12 +57,12 @@ def _careful(f: Callable, asked: Array):
 
 
 def if_any(f: Callable, asked: Array, carry: PyTree, *more: PyTree, kept: bool = True):
-    """The same of an f that by itself leaves members alone that have not asked. kept: as of `largest_in_batch`."""
+    """As `call_where`, for an f that itself ignores members that have not asked. kept: as for `largest_in_batch`."""
     return lax.cond(largest_in_batch(asked, kept), f, lambda carry, *_: carry, carry, *more)
 
 
 def derivative_of(f: Callable, value: Callable) -> PyTree:
-    """value(), which is what f() is, with the derivatives of f: for a way to the value that is no way to those.
+    """value() with the derivatives of f(). Both must be equal; use it if value cannot be differentiated.
 
     >>> import jax, jax.numpy as jnp
     >>> print(jax.grad(lambda x: derivative_of(lambda: x**2, lambda: x * x))(3.0))
@@ -81,7 +82,7 @@ def derivative_of(f: Callable, value: Callable) -> PyTree:
 
 
 def derivative_by(f: Callable, value: Callable, *args) -> PyTree:
-    """value(*args), which is what f(*args) is, with the derivatives of f in those of the arguments that move.
+    """value(*args) with the derivatives of f(*args) by those arguments that have tangents. Both must be equal.
 
     >>> import jax
     >>> print(jax.grad(lambda x: derivative_by(lambda x, y: x**y, lambda x, y: x * x, x, 2))(3.0))
@@ -108,7 +109,7 @@ def derivative_by(f: Callable, value: Callable, *args) -> PyTree:
 
 
 def derivative_at_need(f: Callable, value: Callable, *args):
-    """The same, f traced for a derivative only, unless value closes over numbers that are not known.
+    """As `derivative_by`, but f is traced only if a derivative is taken, unless value closes over tracers.
 
     >>> import jax
     >>> print(jax.grad(lambda x: derivative_at_need(lambda x, y: x**y, lambda x, y: x * x, x, 2))(3.0))

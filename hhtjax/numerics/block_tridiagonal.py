@@ -1,13 +1,13 @@
-"""Elimination on the blocks of a block tridiagonal matrix: so many operations for each block, however many there are.
+"""Elimination on the blocks of a block tridiagonal matrix, with an effort in proportion to the number of blocks.
 
     A x = b,    L_i x_{i-1} + D_i x_i + U_i x_{i+1} = b_i
 
     S_i = D_i - L_i W_{i-1},   W_i = S_i^-1 U_i              once for a matrix
     y_i = S_i^-1 (b_i - L_i y_{i-1}),   x_i = y_i - W_i x_{i+1}
 
-Pivots are chosen within a block, and blocks are taken in their order. That is enough for positive definite matrices,
-and for saddle points in which no row of a constraint comes before an unknown that it holds: each part of the matrix
-that has been eliminated is then that of a smaller mechanism. Loops over the blocks stay in a kernel.
+Pivots are chosen within a block, and blocks are taken in their order. This is sufficient for positive definite
+matrices. It is also sufficient for saddle points in which each constraint row comes after all unknowns in it, because
+each eliminated part of the matrix then belongs to a smaller mechanism. Loops over the blocks can be part of a kernel.
 """
 
 from __future__ import annotations

@@ -23,10 +23,10 @@ checkpoint = partial(jax.checkpoint, prevent_cse=False)  # inside a scan nothing
 def checkpointed_scan(body: Callable, carry: tuple, length: int, in_batch: bool = False):
     """`lax.scan(body, carry, None, length)` in blocks of about sqrt(length) steps, each in short chunks.
 
-    Reverse mode stores the carry before each block, computes a block again when it comes to it, then keeps
-    the carry before each of its steps, and computes what is inside a step once more: memory for about
-    2 sqrt(length) carries. Where those of all steps take little, it keeps them, and computes no block again.
-    Forward evaluation and forward mode do no extra work.
+    The forward pass of reverse mode stores the carry before each block. The backward pass computes each block again,
+    stores the carry before each of its steps, and computes each step once more. This needs memory for about 2
+    sqrt(length) carries. If the carries of all steps are small, it stores them all and computes no block again. Forward
+    evaluation and forward mode do no extra work.
 
     in_batch: whether this is one member of many.
     """

@@ -1,4 +1,4 @@
-"""What a function closes over, as an argument of it."""
+"""Turns the values that a function closes over into arguments."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from hhtjax.description import PyTree, is_concrete
 
 
 def hoisted(f: Callable, *args: PyTree):
-    """f as a function of (constants, *args), and the constants, all that it closes over; f itself runs once.
+    """(f as a function of (constants, *args), the constants), where constants are all values that f closes over.
 
-    `jax.closure_convert` leaves integers where they are, and a loop or a rule for derivatives would then hold tracers.
+    f runs once. `jax.closure_convert` does not move integers, so that a loop or a derivative rule would hold tracers.
 
     >>> import jax, jax.numpy as jnp
     >>> n = jnp.array(3)
@@ -28,7 +28,7 @@ def hoisted(f: Callable, *args: PyTree):
 
 
 def opened(f: Callable, *args: PyTree):
-    """The same without a `jit` around it.
+    """As `hoisted`, without a `jit` around f.
 
     >>> import jax, jax.numpy as jnp
     >>> n = jnp.array(3)
@@ -45,11 +45,11 @@ def opened(f: Callable, *args: PyTree):
 
 
 def carried(f: Callable, *args: PyTree) -> Partial:
-    """f as a pytree of what is being traced among all that it closes over: for a loop that hands f on.
+    """f as a pytree whose leaves are the tracers that it closes over, for a loop that carries f.
 
     Args:
         f: a function of pytrees of arrays; it runs once.
-        *args: these, or tracers of theirs.
+        *args: its arguments, or tracers of them.
 
     Returns:
         A `jax.tree_util.Partial` with the same values.

@@ -1,10 +1,10 @@
-"""Linear complementarity: z >= 0 and y = M z + q >= 0, of each pair one is 0. For a few rows, as contacts have.
+"""Linear complementarity: z >= 0 and y = M z + q >= 0, with one number of each pair 0. For few rows, as of contacts.
 
     z_0 d + M z + q = y,    z_0 from large to 0 by pivots, each of which keeps z, y >= 0
 
-Lemke's method finds a solution, or that there is none, for all copositive-plus M (z^T M z >= 0 for z >= 0): those of
-contacts with Coulomb friction among them. Rows of M may depend on each other. Ties are broken by a perturbation of q,
-as small as one likes, so that no set of pivots comes twice.
+For copositive-plus M (z^T M z >= 0 for z >= 0) Lemke's method finds a solution, or that there is none. The matrices of
+contacts with Coulomb friction are among these. Rows of M may be dependent. Ties are broken by an arbitrarily small
+perturbation of q, so that no set of pivots occurs twice.
 
 References: C. Lemke, Bimatrix equilibrium points and mathematical programming, Manage. Sci. 11, 1965, 681-689;
 R. Cottle, J.-S. Pang, R. Stone, The linear complementarity problem, 1992, Sec. 4.4 and 4.9.
@@ -36,7 +36,7 @@ class Complement(NamedTuple):
 
 
 def complement(M: Array, q: Array) -> Complement:
-    """The solution for M (n, n) and q (n,). Rows should be of the size of 1: what is small is taken for 0.
+    """The solution for M (n, n) and q (n,). Scale the rows to a size of about 1, because small numbers are taken as 0.
 
     Args:
         M, q: arrays of one dtype.

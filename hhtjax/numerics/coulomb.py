@@ -3,8 +3,9 @@
     y + K f,   f_N >= 0,   (y + K f)_N >= 0,   of each contact one is 0
     |f_T| <= mu (f_N + off),   opposite to (y + K f)_T where that is not 0
 
-f_T is the difference of two parts >= 0, and what slides has a speed >= 0 of its own: 4 m rows, copositive, for which
-Lemke's method finds a solution (Stewart, Trinkle 1996). Rows may depend on each other; then forces are one of many.
+f_T is written as the difference of two parts >= 0, and each contact has a sliding speed >= 0 as another unknown. This
+gives 4 m rows with a copositive matrix, for which Lemke's method finds a solution (Stewart, Trinkle 1996). If rows are
+dependent, the forces are not unique, and one solution is returned.
 """
 
 from __future__ import annotations

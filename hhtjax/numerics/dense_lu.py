@@ -1,8 +1,9 @@
-"""Elimination for one dense matrix that XLA can fuse; LAPACK above a size.
+"""Elimination for a dense matrix that XLA can fuse, and LAPACK for large matrices.
 
-A call to LAPACK costs a microsecond on the CPU, several times a whole step of a small mechanism, so
-up to `UNROLLED` unknowns the elimination is written out as array operations, and up to `SCALAR` as scalar ones; up to
-`LOOPED` it is a loop in a kernel, and LAPACK's elsewhere. Hundreds are LAPACK's in panels.
+On the CPU a call to LAPACK costs a microsecond, several times a whole step of a small mechanism. So for up to `SCALAR`
+unknowns the elimination is written out as scalar operations, for up to `UNROLLED` as array operations. For up to
+`LOOPED` unknowns it is a loop inside a kernel, and LAPACK's elsewhere. Hundreds of unknowns are eliminated by LAPACK in
+panels.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def product(A: Array, x: Array) -> Array:
 
 
 def diagonal(A: Array) -> Array:
-    """Of a full A (n, n), or of a diagonal one (n,), which is its own. jnp.diagonal would ask for the platform."""
+    """The diagonal of a full A (n, n), or of a diagonal one (n,). jnp.diagonal would ask for the platform."""
     if isinstance(A, Sparse):
         return A.diagonal()
     return A if A.ndim == 1 else A.ravel()[:: len(A) + 1]
@@ -82,7 +83,7 @@ def factorize(A):
 
 
 def by_factors(factors: tuple):
-    """The same of a full matrix of more than UNROLLED unknowns, by `panels.lu` of it."""
+    """The function of `factorize` for a full matrix of more than UNROLLED unknowns, from its factors."""
     if len(factors[0]) > LOOPED:
         return partial(_by_lapack, factors)
     ways = _substitute, _by_lapack
@@ -92,8 +93,8 @@ def by_factors(factors: tuple):
 def inverse(A: Array) -> Array:
     """A^-1 (n, n), constant to autodiff, by Gauss and Jordan in a loop: little to compile, for what is done once.
 
-    Rows are measured by the square roots of the diagonal, and those without one by what is left, so that no units
-    choose the pivots.
+    Rows are scaled by the square roots of the diagonal, and those without a diagonal by what is left of them, so that
+    the choice of pivots does not depend on units.
     """
     A, n = lax.stop_gradient(A), len(A)
     if n == 2:

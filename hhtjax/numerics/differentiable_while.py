@@ -1,4 +1,4 @@
-"""A loop whose number of iterations is data, with derivatives forward and reverse."""
+"""A loop whose number of iterations depends on data, with forward and reverse derivatives."""
 
 from __future__ import annotations
 
@@ -25,11 +25,10 @@ LONGEST = SLOTS**LEVELS  # iterations that reverse mode can go back
 def repeat(body: Callable, carry: PyTree, count: Real) -> PyTree:
     """carry -> body(i, carry) for i = 0, ..., count - 1, count a traced integer.
 
-    A while loop, so that another count costs no compilation; its derivatives are such loops too, and cost as many
-    iterations. Reverse mode keeps what derivatives read of the carry before each of up to SLOTS blocks of iterations
-    on each of LEVELS levels, and computes what a block holds again when it comes to it: up to SLOTS iterations twice,
-    up to SLOTS^2 three times.
-    Beyond LONGEST iterations its derivatives are NaN.
+    It is a while loop, so another count needs no compilation. Its derivatives are such loops too, with as many
+    iterations. Reverse mode stores the parts of the carry that derivatives need, before each of up to SLOTS blocks of
+    iterations on each of LEVELS levels. It computes a block again when it reaches it. So up to SLOTS iterations are
+    computed twice, up to SLOTS^2 three times. Beyond LONGEST iterations its derivatives are NaN.
     """
     count = jnp.asarray(count)
     call, constants = hoisted(body, jnp.zeros_like(count), carry)
@@ -245,17 +244,17 @@ def backwards(iterate: Callable, turn: Callable, count: Array, carry: list, foun
 
 
 def implicit_root(f: Callable, guess: Array, search: Callable, tangent_solve: Callable):
-    """A root w of f(w) = 0, and what else the search tells, which is constant to derivatives.
+    """(w, more): a root w of f(w) = 0, and further results of the search, which have zero derivatives.
 
         dw = -A^-1 df,    A = df/dw at the root
 
-    As `lax.custom_root`. But in reverse mode a scan leaves out the rules of `jax.custom_jvp`, and so of
-    `lax.custom_root`, where it divides what is known from what is linear (`_scan_known_hoisting` of JAX): a second
-    derivative then goes through the search. Here the rule gives the root as an operation that is never divided.
+    It is like `lax.custom_root`, with one difference. When a scan in reverse mode separates its known part from its
+    linear part (`_scan_known_hoisting` of JAX), it loses the rules of `jax.custom_jvp`, and so of `lax.custom_root`. A
+    second derivative then goes through the search. Here the root is an operation that is never separated.
 
     Args:
-        f: (n,) -> (n,); differentiated in what it closes over.
-        guess: (n,), where the search begins.
+        f: (n,) -> (n,); differentiated by the values that it closes over.
+        guess: (n,), start of the search.
         search: guess -> (w, more); more are floats.
         tangent_solve: g, y -> x with g(x) = y, for the linear map g of dw; differentiable.
 

@@ -1,4 +1,4 @@
-"""Linear solves that autodiff passes by: of maps and of matrices, by elimination or as a user says."""
+"""Linear solves with derivatives of their own, for maps and matrices, by elimination or by a user's solver."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ RANK_TOLERANCE = 1e-9  # relative size of a singular value of dependent columns;
 def solve_map(f: Callable, b: Array, factorize) -> Array:
     """x with f(x) = b, for a linear map f of (n,) to (n,); `factorize` as below.
 
-    The matrix of f only serves to find x. Derivatives pass through f itself, f(dx) = db - df(x): one
-    direction, where differentiating the matrix would take n.
+    The matrix of f is used only to find x. Derivatives use f itself, f(dx) = db - df(x). This needs one direction;
+    differentiating the matrix would need n.
     """
     return factorize_map(f, b, factorize)(b)
 
@@ -72,7 +72,7 @@ def _solve(f: Callable, b: Array, inverse: Callable) -> Array:
 
 
 class Trusted:
-    """A `factorize` whose results are taken on trust, and which therefore tells what it leaves unsolved.
+    """A `factorize` that cannot guarantee its results, and therefore reports the residual.
 
     tolerance: of the residual relative to the right-hand side, in the 2-norm; None: 1e-6, in float32 1e-3.
     """
@@ -80,14 +80,14 @@ class Trusted:
     tolerance: Any = None
 
     def leaves(self, f: Callable, b: Array, x: Array) -> Array:
-        """What x leaves of b = f(x), relative to b."""
+        """The residual of b = f(x), relative to b."""
         largest = jnp.max(jnp.abs(b))  # whose square may be 0 in float32
         unit = jnp.where(largest == 0, 1, largest)
         left, size = (jnp.sqrt(jnp.sum((y / unit) ** 2)) for y in (f(x) - b, b))
         return lax.stop_gradient(jnp.where(left == 0, 0, left / size))
 
     def accepts(self, left: Array):
-        """Whether so much may be left; what is not a number is for others to tell."""
+        """Whether the residual is acceptable. NaN is accepted here, because other checks report it."""
         tolerance = self.tolerance
         return ~(left > (max(1e-6, 1e4 * float(jnp.finfo(left.dtype).eps)) if tolerance is None else tolerance))
 
@@ -117,7 +117,7 @@ class Structured(Trusted):
 
 
 def factorize_with(solve: Callable | Banded):
-    """The same from a function solve(A, b), which need not be differentiable."""
+    """A `factorize` from a function solve(A, b), which need not be differentiable."""
     if isinstance(solve, Structured):
         return solve
 
@@ -138,8 +138,10 @@ def reuse(factorize: Callable | Banded, inverse: Callable):
 
 
 def factorize_saddle_point(n: int):
-    """The same for A = [[M, -B^T], [B, .]], the first n unknowns and equations measured by the diagonal of A, and the
-    rows below by that: so no units of mass, length or time choose the pivots, with which single precision can fail.
+    """`factorize` for A = [[M, -B^T], [B, .]], with scaled rows and columns.
+
+    The first n unknowns and equations are scaled by the diagonal of A, and the rows below accordingly. So the choice of
+    pivots does not depend on the units of mass, length and time. Otherwise single precision could fail.
     """
 
     def factorize_rows(A: Array):

@@ -1,10 +1,11 @@
-"""Linear solves with a constant matrix and a part that changes: A = A0 - E J E^T, or A0 - J, or A0 + H^T D.
+"""Linear solves with a constant matrix A0 and a part that changes: A = A0 - E J E^T, or A0 - J, or A0 + H^T D.
 
-The inverse of the first is that of A0, and a solve with as many unknowns as E has columns (Woodbury 1950):
+A0 is factorised once. A solve with the first kind also needs one with as many unknowns as E has columns (Woodbury
+1950):
 
     A^-1 b = y + Z J (1 - S J)^-1 E^T y,    y = A0^-1 b,  Z = A0^-1 E,  S = E^T Z
 
-That of the last, with few rows D and A0 as above, is y - Z (1 + D Z)^-1 D y with Z = A0^-1 H^T.
+For the last kind, with few rows D and A0 as above, A^-1 b = y - Z (1 + D Z)^-1 D y with Z = A0^-1 H^T.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Coefficients of power series, order by order, of the operations of `series_program.py`.
+"""Coefficients of power series, order by order, for the operations of `series_program.py`.
 
-The coefficient k of a product is a_k b_0 + a_0 b_k and a sum over those between, sum_{0 < j < k} a_j b_{k-j}. These
-sums wait for nothing that belongs to k: so those of all products of a program are formed at once, on vectors with a
-number for each product, and what is left is a few operations on scalars. Programs of many operations go through a loop
-over k, whose sums have as many terms for each k, zeros among them; those of few are written out.
+The coefficient k of a product is a_k b_0 + a_0 b_k plus the sum of the terms between, sum_{0 < j < k} a_j b_{k-j}.
+These sums need no coefficient of order k. So the sums of all products of a program are computed together, on vectors
+with an entry for each product. Only a few operations on scalars remain. Programs of many operations use a loop over k,
+in which the sums have the same number of terms for each k, some of them zero. Programs of few operations are unrolled.
 """
 
 from __future__ import annotations

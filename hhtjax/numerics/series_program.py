@@ -1,14 +1,15 @@
 """A traced program as operations on power series: sums, products, quotients, roots, and differential equations.
 
-Of numbers that move, x(t0 + s) = sum_k x_k s^k, each operation of a program gives the coefficient k of its result from
-those of its operands up to k (`power_series.py`). Written with D = s d/ds, (D x)_k = k x_k, few operations are enough:
+A number that depends on time is a series x(t0 + s) = sum_k x_k s^k. Each operation of a program gives the coefficient k
+of its result from the coefficients of its operands up to k (`power_series.py`). With D = s d/ds, (D x)_k = k x_k, few
+kinds of operations are needed:
 
     exp x = exp x_0 + I(z D x)            sin x, cos x = sin x_0 + I(c D x), cos x_0 - I(s D x)
     log x = log x_0 + I(D x / x)          x^a = x_0^a + I(a z D x / x)
     tan x = tan x_0 + I((1 + z^2) D x)    atan2(y, x) = atan2(y_0, x_0) + I((x D y - y D x) / (x^2 + y^2))
 
-and so on, z being the result itself and (I g)_k = g_k / k. What depends on parameters alone is computed as it stands.
-A linear solve M x = b is M_0 x_k = b_k - sum_{j > 0} M_j x_{k-j}, with one matrix for all k.
+and so on, where z is the result itself and (I g)_k = g_k / k. Numbers that depend only on parameters are computed as
+they are. A linear solve M x = b becomes M_0 x_k = b_k - sum_{j > 0} M_j x_{k-j}, with the same matrix for all k.
 
 A. Jorba, M. Zou, Experimental Mathematics 14 (2005) 99-117, Sec. 2.
 """

@@ -1,4 +1,4 @@
-"""Newton's method with steps that are shortened where the next would not be shorter."""
+"""Newton's method with damping: a step is shortened until the step after it would be shorter."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""The solve of a step whose matrix is sparse: its entries from elements or products, and an elimination by blocks.
+"""Solves with the sparse matrix of a step: computation of its entries, and elimination by blocks or by SuperLU.
 
-A matrix is given as numbers, and a table of which of them add up to each entry. The numbers are those of elements, or
-products with a few vectors: one for each colour of the columns tells all entries. Where the unknowns can be put in a
-row of small blocks, as in chains, beams, cables and rings of them, the elimination is a loop over these that stays in
-the kernel; else it is SuperLU's, in an order found once.
+A matrix is given as numbers, and a table of the numbers that add up to each entry. The numbers are those of elements,
+or products of the matrix with a few vectors, one for each colour of its columns. If the unknowns can be arranged in a
+row of small blocks, as in chains, beams, cables and rings of them, the elimination is a loop over the blocks inside a
+kernel. Otherwise SuperLU is used, with an order of elimination that is found once.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Plan:
 
     @cached_property
     def is_full(self) -> bool:
-        """Whether all blocks are of one size, and no fewer colours tell them than three for each place."""
+        """Whether all blocks have one size, and computing them takes no fewer colours than three for each place."""
         N, b = len(self.blocks.starts) - 1, self.blocks.size
         return self.is_in_blocks and N > 1 and N * b == self.n and self.colour.max() + 1 >= 3 * b
 
@@ -217,8 +217,8 @@ class Plan:
 
 
 def _row_scale(blocks: Blocks, free: np.ndarray) -> Array:
-    """(N, b): equations are measured by the square roots of their diagonal, and constraints by those of their unknowns,
-    so that no units choose the pivots; as of `factorize_saddle_point`."""
+    """(N, b): scales of the equations, as in `factorize_saddle_point`: square roots of their diagonal, and for
+    constraints those of their unknowns, so that the choice of pivots does not depend on units."""
     d = jnp.abs(_diagonals(blocks.middle))
     first = jnp.where(free, 1 / jnp.sqrt(jnp.where(d == 0, 1, d)), 0)
     if free.all():

@@ -1,4 +1,4 @@
-"""Sparse matrices: numbers that are data in places that are not, so that multiples and sums are sparse, too."""
+"""Sparse matrices with a static pattern and numbers that are data. Multiples and sums of them are sparse too."""
 
 from __future__ import annotations
 

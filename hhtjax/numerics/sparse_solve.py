@@ -1,4 +1,4 @@
-"""`Constant` and `Changing`, of low_rank.py, for full matrices and for `Sparse` ones, which tell what solves leave."""
+"""`Constant` and `Changing` of low_rank.py, for full and `Sparse` matrices; the latter report what a solve leaves."""
 
 from __future__ import annotations
 

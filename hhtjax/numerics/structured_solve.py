@@ -1,7 +1,7 @@
-"""Solvers for large systems, whose cost grows with the number of unknowns: `hht(solve=banded(1))`.
+"""Linear solvers for large systems, whose cost is proportional to the number of unknowns: `hht(solve=banded(1))`.
 
-They are given the linear map dw -> A dw of a step and never its matrix: a band is found by applying the map to a few
-vectors of ones and zeros, and conjugate gradients only apply it.
+They use the linear map dw -> A dw of a step, not its matrix. A band is computed by applying the map to a few vectors of
+ones and zeros. Conjugate gradients only apply the map.
 """
 
 from __future__ import annotations
@@ -59,21 +59,23 @@ class ConjugateGradients(Structured):
 
 
 def banded(half_bandwidth: int = 1, tolerance: Real = None) -> Banded:
-    """For the `solve` of a stepper: M and the Jacobians of the force couple unknowns up to `half_bandwidth` apart.
+    """A solver for matrices with a band, for the `solve` of a stepper: chains, frames, beams.
 
-    One step costs 2 half_bandwidth + 1 tangents of the residual and an elimination, all in proportion to the number of
-    unknowns. M has to be diagonal (n,). For chains, frames, beams; unknowns in the order of the leaves of q.
+    The Jacobians of the force may couple unknowns that are up to `half_bandwidth` apart, in the order of the leaves of
+    q. M must be diagonal (n,). A step costs 2 half_bandwidth + 1 tangents of the residual and an elimination. All of
+    this is proportional to the number of unknowns.
 
     Args:
-        half_bandwidth: a positive integer. Where it is too small, the solve leaves a residual.
-        tolerance: of this residual, relative to the right-hand side (2-norm); 1e-6 by default, 1e-3 in float32. A step
-            above it is a failure that `solution.check()` names; `solution.info.solve_residual` has the largest.
+        half_bandwidth: a positive integer. If it is too small, the solve leaves a residual.
+        tolerance: largest residual, relative to the right-hand side (2-norm); 1e-6 by default, 1e-3 in float32. A step
+            with a larger residual is a failure that `solution.check()` reports. `solution.info.solve_residual` has the
+            largest residual.
 
     Returns:
-        What `hht(solve=...)` takes.
+        A solver for `hht(solve=...)`.
 
     Raises:
-        ValueError: half_bandwidth is no positive integer, or tolerance not positive.
+        ValueError: half_bandwidth is not a positive integer, or tolerance is not positive.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> def springs(q, v, t, params):
@@ -91,22 +93,23 @@ def banded(half_bandwidth: int = 1, tolerance: Real = None) -> Banded:
 
 
 def conjugate_gradients(iterations: int, tolerance: Real = None) -> ConjugateGradients:
-    """For the `solve` of a stepper: that many iterations at every step, so that each costs the same.
+    """A matrix-free solver by conjugate gradients, for the `solve` of a stepper.
 
-    Matrix-free: a tangent of the residual for each iteration. What they leave unsolved is an error of the step. The
-    number needed grows with the square root of the condition of M + beta h^2 K, that is, with the number of elements
-    that a wave crosses in a step. M has to be diagonal (n,); symmetric stiffness and damping.
+    It makes a fixed number of iterations, so every step costs the same: one tangent of the residual for each iteration.
+    The remaining residual is an error of the step. The number of iterations needed grows with the square root of the
+    condition number of M + beta h^2 K, that is, with the number of elements that a wave crosses in a step. M must be
+    diagonal (n,), stiffness and damping symmetric.
 
     Args:
-        iterations: a positive integer.
-        tolerance: as in `banded`. Solves meant to be inexact need a larger one: with Newton's iteration 0.1 is enough
-            for the motion, while derivatives are as exact as the solve.
+        iterations: number of iterations, a positive integer.
+        tolerance: as in `banded`. Use a larger one for intentionally inexact solves. With Newton's iteration 0.1 is
+            enough for the motion; derivatives are only as exact as the solve.
 
     Returns:
-        What `hht(solve=...)` takes.
+        A solver for `hht(solve=...)`.
 
     Raises:
-        ValueError: iterations is no positive integer, or tolerance not positive.
+        ValueError: iterations is not a positive integer, or tolerance is not positive.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> tower = hhtjax.System(jnp.ones(3), lambda q, v, t, params: -100.0 * q)
@@ -122,29 +125,30 @@ def conjugate_gradients(iterations: int, tolerance: Real = None) -> ConjugateGra
 
 @dataclass(frozen=True, eq=False)
 class Detected(Structured):
-    """A sparse matrix, of which the pattern is given, or follows from what the functions of a system read."""
+    """A sparse matrix, whose pattern is given, or is detected from the functions of a system."""
 
     pattern: Any = None
     tolerance: Any = None
 
 
 def sparse_lu(pattern: Any = "auto", tolerance: Real = None) -> Detected:
-    """For the `solve` of a stepper: LU factorisation of a sparse matrix, of any system, constraints included.
+    """A sparse LU solver for any system, also with constraints, for the `solve` of a stepper.
 
-    Its entries are found by products with a few vectors, one for each colour of its columns (Curtis, Powell, Reid
-    1974), and eliminated along the unknowns where these can be put in a row of small blocks, else by SuperLU. It pays
-    from some 30 unknowns on. A `System.from_elements` needs none of it: its own solve knows the elements.
+    The entries of the matrix are computed by products with a few vectors, one for each colour of its columns (Curtis,
+    Powell, Reid 1974). If the unknowns can be arranged in a row of small blocks, the blocks are eliminated in this
+    order. Otherwise SuperLU is used. It is faster than the default from some 30 unknowns on. A `System.from_elements`
+    does not need it: its own solver uses the elements.
 
     Args:
-        pattern: (n, n), of scipy.sparse or an array, not zero wherever a force, or M, may depend on an unknown, in the
-            order of the leaves of v. "auto": what is read from the functions of the system as they are traced.
+        pattern: (n, n), a matrix of scipy.sparse or an array. It must be nonzero wherever a force, or M, may depend on
+            an unknown, in the order of the leaves of v. "auto": detected from the traced functions of the system.
         tolerance: as in `banded`.
 
     Returns:
-        What `hht(solve=...)` takes.
+        A solver for `hht(solve=...)`.
 
     Raises:
-        TypeError, ValueError: a pattern that is none, or not square; a tolerance that is not positive.
+        TypeError, ValueError: not a pattern, or one that is not square; a tolerance that is not positive.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> def links(q, t, params):                                                      # 40 pendulums, each on the next

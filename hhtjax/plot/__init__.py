@@ -1,6 +1,7 @@
 """Charts of runs, steps and fits, by matplotlib: `pip install 'hhtjax[plot]'`.
 
-Every function draws into the axes given as `ax`, or makes a figure, 85 mm wide with 8 pt text, and returns the axes:
+Every function draws into the axes given as `ax` and returns them. Without `ax` it makes a figure, 85 mm wide, with 8 pt
+text:
 
 >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
 >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -4.0 * q)
@@ -10,7 +11,8 @@ Every function draws into the axes given as `ax`, or makes a figure, 85 mm wide 
 ('t (s)', 'q[0] (m)')
 >>> plt.close(ax.figure)
 
-Nothing is shown, no global setting changed; `hhtjax.plot.save(ax.figure, "run", ("png", "pdf"))` writes files.
+The functions do not show the figure and do not change global settings of matplotlib. To write files, call
+`hhtjax.plot.save(ax.figure, "run", ("png", "pdf"))`.
 """
 
 try:

@@ -1,4 +1,4 @@
-"""Charts of error: against the step size, with observed orders, and against the time that it takes."""
+"""Charts of the error over the step size, with observed orders, and of the error over the computing time."""
 
 from __future__ import annotations
 
@@ -27,35 +27,36 @@ def error_against_h(
     key: bool = True,
     ax: Any = None,
 ) -> Any:
-    """Error over step size, both logarithmic, with the observed order of each curve and triangles of whole orders.
+    """Draws the error over the step size, both logarithmic, with the observed orders and slope triangles.
 
     Error and order are
 
-        e = sqrt(mean over samples and entries of (q - reference)^2)       of a sweep,
-        p = median over neighbours of log(e_2/e_1) / log(h_2/h_1),
+        e = sqrt(mean over samples and entries of (q - reference)^2)       for a sweep,
+        p = median over neighbours of log(e_2/e_1) / log(h_2/h_1).
 
-    where rounding at one end, or steps too coarse at the other, leave the median alone as long as most points are
-    between them. Of a curve that bends, whose slopes are more than 1 apart, the least and the largest are given.
+    Rounding at small steps, or too large steps, do not affect the median as long as most points are between them. If
+    the slopes of a curve differ by more than 1, the smallest and the largest are given instead.
 
     Args:
-        dt: step sizes (n,), with `error` as long; or an `ObservedOrder`; or a sweep over step sizes; or several of
-            these by name, {label: sweep} or {label: (dt, error)}.
-        error: (n,); None where dt is one of the others. What is not finite or not positive is left out.
-        reference: of a sweep, q like a member's, at the same times; by default the finest member, which is not drawn.
-        label: of a single curve.
+        dt: step sizes (n,), with `error` of the same length; or an `ObservedOrder`; or a sweep over step sizes; or
+            several of these by name, {label: sweep} or {label: (dt, error)}.
+        error: (n,); None if dt is one of the others. Errors that are not finite or not positive are left out.
+        reference: for a sweep: the exact q of a member, at the same times; by default the finest member, which is then
+            not drawn.
+        label: label of a single curve.
         slopes: orders of the triangles; by default the whole numbers that are observed.
-        unit: of the error. time_unit: of dt.
+        unit: unit of the error. time_unit: unit of dt.
         lines: options of `ax.plot` for some of the curves, {label: {"marker": "x"}}.
-        key: whether there is a legend; without one, curves are called by their names alone, for a legend of several
-            axes together.
-        ax: axes to draw into; None for a figure of its own.
+        key: whether to draw a legend. Without it the labels of curves have no orders, so that several axes can share a
+            legend.
+        ax: axes to draw into; None for a new figure.
 
     Returns:
         The axes.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind, shape or value; a run that is no sweep; lines of no
-        curve.
+        TypeError, ValueError: an argument of a wrong kind, shape or value; a run that is not a sweep; `lines` with a
+        label that no curve has.
 
     >>> import matplotlib.pyplot as plt, numpy as np, hhtjax
     >>> h = np.array([0.01, 0.02, 0.04])
@@ -87,7 +88,7 @@ def error_against_h(
 
 
 def _lines(caller: str, lines, curves):
-    """{label: options} of the user's, which must be of curves that there are."""
+    """{label: options} of the user; raises an error for a label that no curve has."""
     lines = lines or {}
     if unknown := [label for label in lines if label not in curves]:
         raise ValueError(f"{caller}: `lines` must be of {', '.join(map(str, curves))}; received {unknown[0]!r}.")
@@ -95,7 +96,7 @@ def _lines(caller: str, lines, curves):
 
 
 def _curve(one, reference):
-    """(step sizes, errors) of what the user gave, sorted, without those that failed or are zero."""
+    """(step sizes, errors) of a curve, sorted, without errors that are not finite or not positive."""
     if isinstance(one, ObservedOrder):
         one = one.dt, one.error
     elif isinstance(one, Solution):
@@ -117,7 +118,7 @@ def _curve(one, reference):
 
 
 def _errors_of_sweep(sweep, reference):
-    """Step sizes, and RMS of q less the reference over samples and entries; NaN of members that failed."""
+    """Step sizes, and RMS error of q over samples and entries; NaN for members that failed."""
     if np.ndim(sweep.t) != 2:
         raise ValueError(f"error_against_h: `dt` must be a sweep; received a run, t of shape {np.shape(sweep.t)}.")
     h = np.asarray(sweep.dt)
@@ -138,12 +139,12 @@ def _errors_of_sweep(sweep, reference):
 
 
 def _order(h, e):
-    """Median of the slopes between neighbours; NaN of a single point."""
+    """Median of the slopes between neighbours; NaN for a single point."""
     return float(np.median(np.diff(np.log(e)) / np.diff(np.log(h)))) if len(h) > 1 else np.nan
 
 
 def _in_words(h, e):
-    """The order, or the least and the largest slope where they are more than 1 apart; nothing of a single point."""
+    """The order in words; the smallest and the largest slope if they differ by more than 1; "" for a single point."""
     if len(h) < 2:
         return ""
     slopes = np.diff(np.log(e)) / np.diff(np.log(h))
@@ -153,7 +154,7 @@ def _in_words(h, e):
 
 
 def _triangle(ax, p, curve, curves, taken):
-    """A right triangle of slope p at a curve, its order beside it, where least is in its way; its corners."""
+    """Draws a triangle of slope p, with its number, where it covers fewest curves; returns its extent in x and y."""
     h, e = np.log(curve)
     places = []
     for start in (0.5, 0.25, 0.7, 0.05):
@@ -171,7 +172,7 @@ def _triangle(ax, p, curve, curves, taken):
 
 
 def _in_the_way(x: Any, y: Any, curves: Any, taken: Any) -> int:
-    """How many curves cross the box between (x0, y0) and (x1, y1), and how many triangles; all of it in logarithms."""
+    """Number of curves and triangles that overlap the box between (x0, y0) and (x1, y1); all in logarithms."""
     hits = 0
     for h, e in curves:
         over = np.interp(np.linspace(x[0], x[1], 5), np.log(h), np.log(e), left=np.nan, right=np.nan)
@@ -189,20 +190,20 @@ def work_precision(
     key: bool = True,
     ax: Any = None,
 ) -> Any:
-    """Error over the time that it takes, both logarithmic: what lies further down and left is better.
+    """Draws the error over the computing time, both logarithmic. Curves further down and to the left are better.
 
     Args:
-        curves: {label: (times, errors)}, two vectors each; what is not finite or not positive is left out.
-        ours: labels that are drawn with bold, full lines, the others with thin, broken ones.
-        xlabel, ylabel: with their units, of whatever work and error are counted in.
+        curves: {label: (times, errors)}, two vectors each. Numbers that are not finite or not positive are left out.
+        ours: labels of the curves drawn with bold, solid lines. The others have thin, dashed ones.
+        xlabel, ylabel: labels of the axes, with the units of work and error.
         lines, key, ax: as in `hhtjax.plot.error_against_h`.
 
     Returns:
         The axes.
 
     Raises:
-        TypeError, ValueError: curves is no dict, empty, or of arrays of different lengths; ours or lines have other
-        labels.
+        TypeError, ValueError: curves is not a dict, is empty, or has arrays of different lengths; ours or lines have
+        labels that are not in curves.
 
     >>> import matplotlib.pyplot as plt, hhtjax
     >>> curves = {"hht": ([1e-3, 2e-3], [1e-2, 2.5e-3]), "peer": ([1e-2, 2e-2], [1e-2, 6e-4])}

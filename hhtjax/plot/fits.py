@@ -1,4 +1,4 @@
-"""Charts of an identification: estimates with their intervals, correlations, a profile."""
+"""Charts of an identification: estimates with intervals, correlations, profiles, and a comparison of models."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ SHOWN_NUMBERS = 8  # parameters up to which the correlations are written into th
 
 
 def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: Any = None, ax: Any = None) -> Any:
-    """Estimates with their confidence intervals, in per cent of the estimate, or of the truth:
+    """Draws estimates with their confidence intervals, in per cent of the estimate, or of the true value:
 
         100 (x - reference) / |reference|,    x: the estimate and the ends of `result.interval(level)`
 
-    What the residuals do not determine has a cross and no interval.
+    A parameter that the residuals do not determine is a cross without interval.
 
     Args:
-        results: a `FitResult` with covariance, or several of one model by name, {label: result}.
-        level: of the intervals, between 0 and 1.
-        truth: params, where they are known: what intervals are relative to, instead of the first estimate.
-        entries: which parameters, by name as in `result.summary()`; by default all that were fitted.
-        ax: axes to draw into; None for a figure of its own.
+        results: a `FitResult` with covariance, or several fits of the same model by name, {label: result}.
+        level: confidence level of the intervals, between 0 and 1.
+        truth: the true params, if they are known; used as reference instead of the first estimate.
+        entries: names of the parameters to draw, as in `result.summary()`; by default all that were fitted.
+        ax: axes to draw into; None for a new figure.
 
     Returns:
         The axes.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; a fit without covariance; a parameter that is 0,
-        of which there are no per cent (leave it out by `entries`).
+        for which per cent are not defined (leave it out by `entries`).
 
     >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
     >>> t = jnp.arange(100.0)
@@ -59,7 +59,7 @@ def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: 
         raise ValueError("estimates: `truth` must be structured like the params of the fit.")
     size = parameter_values(against)
     if zero := [names[i] for i in kept if size[i] == 0]:
-        raise ValueError(f"estimates: `{zero[0]}` is 0, of which there are no per cent; leave it out by `entries`.")
+        raise ValueError(f"estimates: `{zero[0]}` is 0, so per cent are not defined; leave it out by `entries`.")
     with canvas("estimates", ax, height=22 + 8 * len(kept)) as (panel,):
         panel.axvline(0, color="black", lw=0.6)
         for i, (label, result) in enumerate(named.items()):
@@ -75,7 +75,7 @@ def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: 
 
 
 def _kept(names: list, result: FitResult, entries) -> np.ndarray:
-    """Which numbers of params are drawn."""
+    """Indices of the parameters to draw."""
     if entries is None:
         return np.flatnonzero(result.free)
     entries = (entries,) if isinstance(entries, str) else tuple(entries)
@@ -85,7 +85,7 @@ def _kept(names: list, result: FitResult, entries) -> np.ndarray:
 
 
 def _intervals(ax, result, level, kept, size, at, label, number):
-    """The markers and bars of one fit."""
+    """Draws the markers and bars of one fit."""
     value = parameter_values(result.params)
     lower, upper = map(parameter_values, result.interval(level))
     middle, reach = 100 * (value - size) / abs(size), 100 * np.stack([value - lower, upper - value]) / abs(size)
@@ -100,19 +100,19 @@ def _intervals(ax, result, level, kept, size, at, label, number):
 
 
 def correlations(result: FitResult, *, ax: Any = None) -> Any:
-    """The correlation matrix of the estimates that were fitted; of up to 8 its numbers too.
+    """Draws the correlation matrix of the estimates; for up to 8 parameters with its numbers.
 
         R_ij = C_ij / sqrt(C_ii C_jj),    C: the covariance of the fit
 
     Args:
         result: a `FitResult` with covariance.
-        ax: axes to draw into, beside which a colour bar is put; None for a figure of its own.
+        ax: axes to draw into, with a colour bar beside them; None for a new figure.
 
     Returns:
         The axes.
 
     Raises:
-        TypeError, ValueError: no fit, or one without covariance.
+        TypeError, ValueError: not a fit, or a fit without covariance.
 
     >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
     >>> t = jnp.arange(100.0)
@@ -143,15 +143,15 @@ def correlations(result: FitResult, *, ax: Any = None) -> Any:
 def profile(
     found: Profile, *, name: str = "parameter", unit: str | None = None, result: FitResult | None = None, ax: Any = None
 ) -> Any:
-    """The deviance over one parameter, with its 95 % bound, 3.84, and the parabola that the standard error promises,
+    """Draws the deviance over one parameter, with its 95 % bound, 3.84. With `result` also the parabola
 
         ((x - estimate) / standard error)^2.
 
     Args:
-        found: of `hhtjax.identification.profile`.
-        name, unit: of the parameter.
-        result: a `FitResult`, for the parabola, in which `name` then is a parameter's; None for none.
-        ax: axes to draw into; None for a figure of its own.
+        found: a `Profile`, from `hhtjax.identification.profile`.
+        name, unit: name and unit of the parameter.
+        result: a `FitResult` that has the parameter `name`, for the parabola; None: no parabola.
+        ax: axes to draw into; None for a new figure.
 
     Returns:
         The axes.
@@ -211,22 +211,22 @@ def fit_overview(
     time_unit: str = "s",
     frequency_unit: str = "Hz",
 ) -> Any:
-    """What a fit leaves over, in time and frequency, and below it estimates and correlations, where it has any.
+    """Draws the residual of a fit over time and its spectrum, and below them the estimates and their correlations.
 
-    The residual is that of the first channel, of the first record where there are many, as in `FitResult.residual`; its
-    spectrum that of `hhtjax.plot.fit_against_data`. Where the parameters cannot be drawn as in
-    `hhtjax.plot.estimates`, because the estimate is 0, they are left out there.
+    The residual is that of the first channel (and of the first record, if there are several), as in
+    `FitResult.residual`. Its spectrum is computed as in `hhtjax.plot.fit_against_data`. Parameters whose estimate is 0
+    are left out of the estimates, because they cannot be drawn in per cent.
 
     Args:
-        result: a `FitResult`, whose residuals (of each record) have time as their first axis, 8 of them or more.
-        sampling_rate: residuals in a unit of time.
-        unit: of the residual. time_unit, frequency_unit: as in `hhtjax.plot.fit_against_data`.
+        result: a `FitResult`. Its residuals (of each record) must have time as first axis, with at least 8 samples.
+        sampling_rate: number of residuals in a unit of time.
+        unit: unit of the residual. time_unit, frequency_unit: as in `hhtjax.plot.fit_against_data`.
 
     Returns:
-        Axes (4,): residual, its spectrum, estimates, correlations; (2,) of a fit without covariance.
+        Axes (4,): residual, its spectrum, estimates, correlations; (2,) for a fit without covariance.
 
     Raises:
-        TypeError, ValueError: no fit; a sampling rate that is not positive; residuals that are too few.
+        TypeError, ValueError: not a fit; a sampling rate that is not positive; fewer than 8 residuals.
 
     >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
     >>> t = jnp.arange(100.0)
@@ -273,22 +273,22 @@ GREY = "#808080"
 
 
 def held_out(found: Comparison, *, unit: str | None = None, ax: Any = None) -> Any:
-    """Errors of each model on the segments that its fit did not see: each segment, and the root of their mean square,
+    """Draws the errors of each model on the segments left out of its fits: one for each segment, and their rms,
 
-        sqrt(mean_g e_g^2),    e_g: rms of the residual on segment g by the parameters fitted to the others.
+        sqrt(mean_g e_g^2),    e_g: rms of the residual on segment g with the parameters fitted to the others.
 
-    The model that `compare` takes is filled.
+    The marker of the model that `compare` has chosen is filled.
 
     Args:
-        found: of `compare`, given the residual functions.
-        unit: of the residuals.
-        ax: axes to draw into; None for a figure of its own.
+        found: a `Comparison`, from `compare` with `residuals`.
+        unit: unit of the residuals.
+        ax: axes to draw into; None for a new figure.
 
     Returns:
         The axes.
 
     Raises:
-        TypeError, ValueError: no comparison, or one without errors on segments.
+        TypeError, ValueError: not a comparison, or one without errors on segments.
 
     >>> import matplotlib.pyplot as plt, numpy as np, hhtjax
     >>> errors = np.array([[2.0, 3.0], [1.0, 1.0]])
@@ -302,7 +302,7 @@ def held_out(found: Comparison, *, unit: str | None = None, ax: Any = None) -> A
     if not isinstance(found, Comparison):
         raise TypeError(f"held_out: `found` must be a Comparison, of compare; received {type(found).__name__}.")
     if found.held_out is None:
-        raise ValueError("held_out: `found` has no errors on segments; give `residuals` to compare.")
+        raise ValueError("held_out: `found` must have errors on segments left out: give `residuals` to compare.")
     count = len(found.names)
     with canvas("held_out", ax, height=22 + 8 * count) as (panel,):
         for i, errors in enumerate(found.held_out):

@@ -1,4 +1,4 @@
-"""A chart of a record: measured and simulated, what is left over, and spectra."""
+"""A chart of a record: measured and simulated output, residual, and spectra."""
 
 from __future__ import annotations
 
@@ -25,21 +25,20 @@ def fit_against_data(
     names: Any = ("measured", "simulated"),
     ax: Any = None,
 ) -> Any:
-    """Measured and simulated output, below them the residual, measured - simulated, and the spectra of record and
-    residual.
+    """Draws measured and simulated output, the residual (measured - simulated), and spectra of record and residual.
 
-    Spectra are roots of one-sided power spectral densities, by Welch's method: means over half overlapping windows of
-    a quarter to a half of the record, each less its mean. So their unit is the output's over the root of a frequency,
-    and the integral of their square is the variance.
+    A spectrum is the square root of the one-sided power spectral density, by Welch's method: a mean over half
+    overlapping windows of a quarter to a half of the record, from each of which its mean is subtracted. So its unit is
+    that of the output over the square root of a frequency, and the integral of its square is the variance.
 
     Args:
-        times: (N,), at equal distances, N >= 8.
-        measured, simulated: (N,), in one unit; NaN where nothing was measured, which counts as the mean in the spectra.
-        unit, ylabel: of the output, and its name.
-        time_unit: of times. frequency_unit: one over that.
-        show: (first, last), the part of the time that is drawn; spectra are of all.
-        names: of the two records in the legend.
-        ax: three axes to draw into, or two, for output and residual alone; None for a figure of its own.
+        times: (N,), equally spaced, N >= 8.
+        measured, simulated: (N,), in the same unit. NaN where nothing was measured; the spectra use the mean there.
+        unit, ylabel: unit and name of the output.
+        time_unit: unit of times. frequency_unit: its reciprocal.
+        show: (first, last), the part of the time to draw. Spectra use the whole record.
+        names: names of the two records in the legend.
+        ax: three axes to draw into, or two, for output and residual only; None for a new figure.
 
     Returns:
         Three axes, (3,): output, residual, spectra; or the two that were given.
@@ -85,7 +84,7 @@ def fit_against_data(
 
 
 def densities(ax, records: dict, rate: float, unit: str | None, frequency_unit: str):
-    """Spectra of records by name: the residual blue, what was measured grey."""
+    """Draws spectra of records by name: the residual in blue, measurements in grey."""
     for name, values in records.items():
         frequency, density = _spectrum(values, rate)
         colour = COLOURS[0] if name == "residual" else MEASURED
@@ -114,7 +113,7 @@ def _record(times, measured, simulated):
 
 
 def _spectrum(values: np.ndarray, rate: float):
-    """Frequencies, and roots of the power spectral density, by Welch's method."""
+    """Frequencies, and square roots of the power spectral density, by Welch's method."""
     there = np.isfinite(values)
     values = np.where(there, values, np.mean(values[there]) if there.any() else 0.0)
     length = 2 ** int(np.log2(max(8, len(values) // 2)))

@@ -1,4 +1,4 @@
-"""Charts of what a step does to a linear motion, over w h or in the complex plane."""
+"""Charts of the effect of a step on a linear motion, over w h or in the complex plane."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from hhtjax.plot.styles import canvas, legend, look
 from hhtjax.steppers.stepper import Stepper, require_stepper
 
 WIDE = np.logspace(-2, 3, 251)  # w h of the spectral radius
-NEAR = np.linspace(0.02, 3.0, 150)  # w h that still turn
+NEAR = np.linspace(0.02, 3.0, 150)  # w h of oscillations that the steps can represent
 
 
 def spectral_radius(steppers: Any, *, frequency: Any = None, damping: float = 0.0, ax: Any = None) -> Any:
-    """The factor by which a step changes an oscillation at most, over w h: below 1 it damps, above 1 it is unstable.
+    """Draws the spectral radius over w h. Below 1 a step damps an oscillation; above 1 it is unstable.
 
-        rho = max |eigenvalue of A|,    A: of `hhtjax.analysis.oscillator_matrix`
+        rho = max |eigenvalue of A|,    A: see `hhtjax.analysis.oscillator_matrix`
 
     Args:
         steppers: a stepper, or several by name, {label: stepper}.
         frequency: w h, natural frequency times step size in rad, a vector of positive numbers; by default 0.01 to 1000.
         damping: the damping ratio of the oscillator.
-        ax: axes to draw into; None for a figure of its own.
+        ax: axes to draw into; None for a new figure.
 
     Returns:
         The axes.
@@ -43,11 +43,11 @@ def spectral_radius(steppers: Any, *, frequency: Any = None, damping: float = 0.
 
 
 def damping_ratio(steppers: Any, *, frequency: Any = None, damping: float = 0.0, ax: Any = None) -> Any:
-    """The damping ratio that the discrete oscillator has, over w h; of an undamped one all of it is the method's.
+    """Draws the damping ratio of the oscillator in the steps, over w h.
 
         -Re(r)/|r|,    r = log(principal eigenvalue of A)
 
-    Where nothing oscillates, there is no curve.
+    With damping = 0 this is the numerical damping of the method. There is no curve where no eigenvalue oscillates.
 
     Args:
         steppers, damping, ax: as in `hhtjax.plot.spectral_radius`.
@@ -69,11 +69,11 @@ def damping_ratio(steppers: Any, *, frequency: Any = None, damping: float = 0.0,
 
 
 def period_elongation(steppers: Any, *, frequency: Any = None, damping: float = 0.0, ax: Any = None) -> Any:
-    """The relative error of the natural period, over w h.
+    """Draws the relative error of the natural period over w h.
 
         w h/|r| - 1,    r = log(principal eigenvalue of A)
 
-    Where nothing oscillates, there is no curve.
+    There is no curve where no eigenvalue oscillates.
 
     Args:
         steppers, frequency, damping, ax: as in `hhtjax.plot.damping_ratio`.
@@ -96,7 +96,7 @@ def period_elongation(steppers: Any, *, frequency: Any = None, damping: float = 
 def _over_frequency(
     caller: str, ylabel: str, steppers: dict, frequency: np.ndarray, damping: float, ax, default: np.ndarray
 ):
-    """One of the functions of `hhtjax.analysis` with this name, for each stepper."""
+    """Draws the function of `hhtjax.analysis` that has the name of the caller, for each stepper."""
     named = _named(caller, steppers)
     frequency = default if frequency is None else np.asarray(frequency)
     if frequency.ndim != 1 or not np.all(frequency > 0):
@@ -113,7 +113,7 @@ def _over_frequency(
 
 
 def _named(caller: str, steppers: dict):
-    """{label: stepper}; one alone has no label."""
+    """{label: stepper}; a single stepper has the label None."""
     if isinstance(steppers, Stepper):
         return {None: steppers}
     if not isinstance(steppers, dict) or not steppers:
@@ -126,15 +126,15 @@ def _named(caller: str, steppers: dict):
 def stability_region(
     steppers: Any, *, real: Any = (-8.0, 8.0), imag: Any = (-8.0, 8.0), points: int = 121, ax: Any = None
 ) -> Any:
-    """Where y' = lambda y is stable, in the plane of z = h lambda: shaded, with its edge.
+    """Draws the region of z = h lambda in which a stepper is stable for y' = lambda y: shaded, with its edge.
 
-        stable: |eigenvalue| <= 1 for all of the step's, as in `hhtjax.analysis.stability_region`
+        stable: |eigenvalue| <= 1 for all eigenvalues of the step, as in `hhtjax.analysis.stability_region`
 
     Args:
         steppers: a stepper, or several by name, {label: stepper}.
-        real, imag: the part of the plane, (least, largest) each.
-        points: in each direction, at least 2; the edge is interpolated between them.
-        ax: axes to draw into; None for a figure of its own.
+        real, imag: (smallest, largest) real and imaginary part of the drawn part of the plane.
+        points: number of points in each direction, at least 2. The edge is interpolated between them.
+        ax: axes to draw into; None for a new figure.
 
     Returns:
         The axes.

@@ -1,4 +1,4 @@
-"""How charts look: colours that colour-blind readers tell apart, 8 pt text at the width of a column, vector text."""
+"""The style of charts: colours that colour-blind readers can distinguish, 8 pt text, the width of a column."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ MM = 1 / 25.4  # inches
 
 
 def style():
-    """A context in which matplotlib draws like this module: 8 pt text, Okabe and Ito's colours, constrained layout.
+    """A context in which matplotlib draws in the style of this module: 8 pt text, Okabe and Ito's colours.
 
-    The settings are `PARAMETERS`; outside, the user's own hold.
+    The settings are `PARAMETERS`. Outside the context the settings of matplotlib are unchanged.
 
     Returns:
         A context manager.
@@ -79,19 +79,19 @@ def style():
 def subplots(
     rows: int = 1, columns: int = 1, *, width: float = COLUMN, height: float | None = None, **options: Any
 ) -> tuple[Any, Any]:
-    """A figure and its axes as of `plt.subplots`, in this style, with sizes in mm.
+    """Makes a figure and its axes, like `plt.subplots`, in the style of this module, with sizes in mm.
 
     Args:
-        rows, columns: how many panels.
-        width: of the figure in mm, 85 for a column of text, 175 for a page.
-        height: of the figure in mm; by default panels of four to three.
-        **options: as for `plt.subplots`.
+        rows, columns: number of panels.
+        width: width of the figure in mm: 85 for a column of text, 175 for a page.
+        height: height of the figure in mm; by default the panels have the ratio 4:3.
+        **options: options of `plt.subplots`.
 
     Returns:
-        The figure, and its axes as `plt.subplots` gives them: one, (n,) or (rows, columns).
+        The figure, and its axes as `plt.subplots` returns them: one, (n,) or (rows, columns).
 
     Raises:
-        TypeError, ValueError: rows, columns, width or height is no positive number.
+        TypeError, ValueError: rows, columns, width or height is not a positive number.
 
     >>> import matplotlib.pyplot as plt, hhtjax
     >>> figure, axes = hhtjax.plot.subplots(1, 2, width=175)
@@ -112,13 +112,13 @@ def subplots(
 
 
 def pin(ax):
-    """Fixes what matplotlib would read from the settings that hold when a figure is drawn, not when it is made."""
+    """Sets properties that matplotlib otherwise takes from the global settings when the figure is drawn."""
     ax.tick_params(which="both", labelsize=TEXT, width=0.6)
     ax.grid(True, color="#b0b0b0", alpha=0.3, linewidth=0.5)
 
 
 class _Between(Formatter):
-    """Labels between the decades of a logarithmic axis: 2 and 5, where fewer than two decades have one."""
+    """Labels between the decades of a logarithmic axis: 2 and 5, if fewer than two decades are labelled."""
 
     def __call__(self, x, pos=None):
         axis: Any = self.axis
@@ -131,7 +131,7 @@ class _Between(Formatter):
 
 
 def thin_ticks(ax):
-    """Keeps the labels between the decades of logarithmic axes from running into each other."""
+    """Avoids overlapping labels between the decades of logarithmic axes."""
     for axis in (ax.xaxis, ax.yaxis):
         if axis.get_scale() == "log" and isinstance(axis.get_minor_formatter(), LogFormatterSciNotation):
             axis.set_minor_formatter(_Between())
@@ -139,7 +139,7 @@ def thin_ticks(ax):
 
 @contextmanager
 def canvas(caller: str, ax, rows: int = 1, width: int = COLUMN, height: Real = None, **options: PyTree):
-    """The axes given, checked, or those of a new figure, and its style while they are drawn into: an array (rows,)."""
+    """A context with the given axes, checked, or those of a new figure in its style: an array (rows,)."""
     if ax is None:
         with style():
             axes = subplots(rows, 1, width=width, height=height, squeeze=False, **options)[1][:, 0]
@@ -155,21 +155,21 @@ def canvas(caller: str, ax, rows: int = 1, width: int = COLUMN, height: Real = N
 
 
 def look(i: int, marker: bool = False) -> dict[str, Any]:
-    """Colour, line style and, if asked for, marker of the curve with number i."""
+    """Colour, line style and optionally marker of curve number i."""
     chosen = {"color": COLOURS[i % len(COLOURS)], "ls": LINES[i % len(LINES)]}
     return chosen | ({"marker": MARKERS[i % len(MARKERS)]} if marker else {})
 
 
 def legend(ax, handles=None, labels: list | None = None, **options: Any):
-    """A legend above the axes, where it covers no curve, in as many columns as fit; None where nothing has a label.
+    """Draws a legend above the axes, where it covers no curve, in as many columns as fit.
 
     Args:
         ax: axes.
         handles, labels: as for `ax.legend`; by default all curves that have a label.
-        **options: further ones of `ax.legend`.
+        **options: further options of `ax.legend`.
 
     Returns:
-        matplotlib's legend, or None.
+        matplotlib's legend; None if no curve has a label.
 
     Raises:
         TypeError: an option that `ax.legend` does not know.
@@ -193,7 +193,7 @@ def legend(ax, handles=None, labels: list | None = None, **options: Any):
 
 
 def _share(ax) -> Real:
-    """Of the width of its figure, that axes have with their labels."""
+    """Share of the width of the figure that the axes have with their labels."""
     cell = ax.get_subplotspec()
     if cell is None:
         return ax.get_position().width
@@ -203,7 +203,7 @@ def _share(ax) -> Real:
 
 
 def _columns(labels: list, room: Real) -> int:
-    """The most columns of a legend that fit into `room` points, by the width of the widest label of each."""
+    """The largest number of columns of a legend that fits into `room` points."""
     size = [TextPath((0, 0), label, size=TEXT).get_extents().width if label.strip() else 0 for label in labels]
     for columns in range(len(labels), 1, -1):
         widest = [max(part) for part in np.array_split(size, columns)]  # as matplotlib deals them out
@@ -213,18 +213,18 @@ def _columns(labels: list, room: Real) -> int:
 
 
 def save(figure, path, formats: Sequence[str] = ("png",)) -> list[Path]:
-    """Writes a figure as path.png (200 dpi), path.pdf, path.svg, with text as text.
+    """Writes a figure as path.png (200 dpi), path.pdf or path.svg. pdf and svg contain text, not outlines.
 
     Args:
-        figure: of matplotlib.
-        path: without ending; its folder must exist.
+        figure: a figure of matplotlib.
+        path: path without suffix; its folder must exist.
         formats: a tuple of "png", "pdf", "svg".
 
     Returns:
         The paths of the files.
 
     Raises:
-        TypeError, ValueError: figure is none; formats has others than png, pdf and svg.
+        TypeError, ValueError: figure is not a figure; formats has entries other than png, pdf and svg.
         OSError: a file that cannot be written.
 
     >>> import matplotlib.pyplot as plt, pathlib, tempfile, hhtjax
@@ -305,12 +305,12 @@ def chosen_entries(caller: str, solution, quantity, entries):
 
 
 def shown_name(quantity, name):
-    """q[0] for the entry [0] of an array; of a dict the entry's own name."""
+    """q[0] for the entry [0] of an array; for a dict the name of the entry."""
     return f"{SYMBOLS[quantity]}{name}" if name == "" or name.startswith("[") else name
 
 
 def unit_of(units, name, leaf):
-    """The unit of one entry; units: a word, or words by entry or leaf, or None."""
+    """The unit of one entry. units: a unit for all, or a dict of units by entry or leaf, or None."""
     return units.get(name, units.get(leaf)) if isinstance(units, dict) else units
 
 

@@ -1,4 +1,4 @@
-"""Charts of one run: over time, in the phase plane, and how far its constraints drift."""
+"""Charts of one run: over time, in the phase plane, constraint drift, and energy balance."""
 
 from __future__ import annotations
 
@@ -43,23 +43,23 @@ def trajectory(
     ax: Any = None,
     **line: Any,
 ) -> Any:
-    """q, v, acceleration, multipliers or internal states over time, a curve for each entry.
+    """Draws q, v, acceleration, multipliers or internal states over time, with a curve for each entry.
 
     Events of the run are thin vertical lines.
 
     Args:
-        solution: of one run, of a batch its member by `jax.tree.map(lambda x: x[i], solution)`.
-        quantities: "q", "v", "acceleration", "multipliers" or "z"; several as a tuple, one panel above the other.
-        entries: which to draw, by name: "[0]" of an array, "phi" or "x[1]" of a dict, "x" for all of a leaf.
-        units: a word; or words by entry or leaf, {"x": "m"}; or one of these by quantity, {"q": "rad", "v": "rad/s"}.
-        time_unit: of the times.
-        label: put before the names of the curves, to tell runs in one chart.
-        key: whether there is a legend; without one the caller makes one, of several axes together.
-        ax: axes to draw into, as many as quantities; None for a figure of its own.
+        solution: solution of one run. Select member i of a batch by `jax.tree.map(lambda x: x[i], solution)`.
+        quantities: "q", "v", "acceleration", "multipliers" or "z"; or a tuple of several, one panel for each.
+        entries: names of the entries to draw: "[0]" of an array, "phi" or "x[1]" of a dict, "x" for a whole leaf.
+        units: a unit; or units by entry or leaf, {"x": "m"}; or either by quantity, {"q": "rad", "v": "rad/s"}.
+        time_unit: unit of time.
+        label: prefix of the names of the curves, to distinguish several runs in one chart.
+        key: whether to draw a legend. Pass False to draw one legend for several axes yourself.
+        ax: axes to draw into, one for each quantity; None for a new figure.
         **line: further options of `ax.plot`.
 
     Returns:
-        The axes; of several quantities an array of them.
+        The axes; an array of axes for several quantities.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; a batch of runs; a quantity that the run lacks.
@@ -93,7 +93,7 @@ def trajectory(
 
 
 def _draw(ax, t, quantity, found, units, label, line):
-    """The entries of one quantity; the unit goes to the axis if they share it, else to each name."""
+    """Draws the entries of one quantity. A common unit is written at the axis, different units after each name."""
     each = [unit_of(units, name, leaf) for name, (leaf, _) in found.items()]
     shared = each[0] if len(set(each)) == 1 else None
     start = len(ax.lines)
@@ -106,7 +106,7 @@ def _draw(ax, t, quantity, found, units, label, line):
 
 
 def _mark(ax, times):
-    """Vertical lines behind the curves; they count as none of them."""
+    """Draws vertical lines behind the curves; they do not count as curves."""
     style = {"colors": "0.6", "lw": 0.6, "ls": ":", "zorder": 0, "label": "_event"}
     ax.vlines(times[np.isfinite(times)], 0, 1, transform=ax.get_xaxis_transform(), **style)
 
@@ -120,19 +120,19 @@ def phase_plane(
     ax: Any = None,
     **line: Any,
 ) -> Any:
-    """Velocity over position, a curve for each entry, its start marked.
+    """Draws velocity over position, a curve for each entry, with its start marked.
 
     Args:
-        solution: of one run.
-        entries: which to draw, as in `trajectory`; all by default.
-        units: (of position, of velocity).
+        solution: solution of one run.
+        entries: names of the entries to draw, as in `trajectory`; by default all.
+        units: (unit of position, unit of velocity).
         label, ax, **line: as in `trajectory`.
 
     Returns:
         The axes.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind or value; a rotation, which has no such plane.
+        TypeError, ValueError: an argument of a wrong kind or value; a rotation, which has no phase plane.
 
     >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -4.0 * q)
@@ -146,7 +146,7 @@ def phase_plane(
     if units is not None and (isinstance(units, str) or len(units) != 2):
         raise ValueError(f"phase_plane: `units` must be two, of position and velocity; received {units!r}.")
     if solution.v is None:
-        raise ValueError("phase_plane: `solution` must have velocities; received a run without.")
+        raise ValueError("phase_plane: `solution` must have velocities; received a run without velocities.")
     q = chosen_entries("phase_plane", solution, "q", entries)
     v = chosen_entries("phase_plane", solution, "v", None)
     if missing := [name for name in q if name not in v]:
@@ -176,13 +176,13 @@ def constraint_drift(
     ax: Any = None,
     **line: Any,
 ) -> Any:
-    """How far a run is from its constraints: the largest |Phi| and |dPhi/dt| between saved times, logarithmic.
+    """Draws the violation of constraints: the largest |Phi| and |dPhi/dt| between saved times, logarithmic.
 
-    What is zero does not show.
+    Zeros are not drawn.
 
     Args:
-        solution: of one run of a system with constraints.
-        unit: of Phi. time_unit: of the times.
+        solution: solution of one run of a system with constraints.
+        unit: unit of Phi. time_unit: unit of time.
         label, ax, **line: as in `trajectory`.
 
     Returns:
@@ -218,12 +218,12 @@ def constraint_drift(
 
 
 # ----------------------------------------------------------------------------
-# A chart of where energy is, where it went, and what the method made of it.
+# A chart of the energy balance: energies, work, and the error of the method.
 
 
 @dataclass(frozen=True)
 class LagrangianPotential:
-    """V(q, t) = -L(q, 0, t). A class, so that equal Lagrangians are compiled once."""
+    """V(q, t) = -L(q, 0, t). It is a class, so that equal Lagrangians are compiled once."""
 
     lagrangian: Any
 
@@ -242,28 +242,28 @@ def energy_balance(
     time_unit: str = "s",
     ax: Any = None,
 ) -> Any:
-    """Energies of a run over time, and below them the energy that the method made or lost,
+    """Draws the energies of a run over time, and below them the energy that the method has added or removed,
 
         made by the method(t) = T(t) + V(t) - T(0) - V(0) - W(t),
 
     with the work W of all forces that have no potential V.
 
     Args:
-        system: of the run; or an `EnergyBalance` alone, in place of it and the next three.
-        solution: of one run.
-        params: those of the run.
-        potential: `potential(q, t, params)`, a scalar; that of a system `from_lagrangian` is known. Without one the
-            work is that of all forces.
-        energy: `energy(q, v, t, params)`, a scalar: instead of the balance, this energy is drawn, and below it how far
-            it is from its first value. Then system and potential are not used.
-        unit: of energy. time_unit: of the times.
-        ax: two axes to draw into; None for a figure of its own.
+        system: system of the run; or only an `EnergyBalance`, without solution, params and potential.
+        solution: solution of one run.
+        params: params of the run.
+        potential: `potential(q, t, params)`, a scalar. For a system `from_lagrangian` it is known. Without a potential,
+            W is the work of all forces.
+        energy: `energy(q, v, t, params)`, a scalar. If given, this energy is drawn instead of the balance, and below it
+            its change since the start. Then system and potential are not used.
+        unit: unit of energy. time_unit: unit of time.
+        ax: two axes to draw into; None for a new figure.
 
     Returns:
-        Two axes, (2,), of energies and of the error.
+        Two axes, (2,): energies, and error.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind or value; no run, or a batch of them; otherwise as
+        TypeError, ValueError: an argument of a wrong kind or value; not a run, or a batch of runs; otherwise as
         `hhtjax.analysis.energy_balance`.
 
     >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
@@ -312,7 +312,7 @@ def _balance(system, solution, params: PyTree, potential):
 
 
 def _given_energy(solution: Solution, params: PyTree, energy: Callable):
-    """The same of an energy function of the user's."""
+    """Times, curves, error and its name, for an energy function given by the user."""
     require_run("energy_balance", solution)
     require_function("energy_balance", "energy", energy, "energy(q, v, t, params)")
     values = jax.vmap(lambda q, v, t: energy(q, v, t, params))(solution.q, solution.v, solution.t)

@@ -1,35 +1,35 @@
-"""Operations of JAX of our own: what a program says of itself, carried through autodiff and vmap.
+"""JAX primitives of this library. They mark parts of a program for the compiler, also through autodiff and vmap.
 
-    one_kernel(f, *args)      f(*args) as one kernel, where XLA can
-    staged(f)                 f, whose results a kernel computes once
-    part(f)                   f, a kernel of its own where it is in none
+    one_kernel(f, *args)      f(*args) as one kernel, if XLA can compile it so
+    staged(f)                 f; inside a kernel its results are computed only once
+    part(f)                   f; outside a kernel it becomes a kernel of its own
     choose(f, g, *args)       f(*args) in a kernel, g(*args) elsewhere
-    consistent(f)             f, of which what is compared is computed once
-    structural(x)             x, whose zeros are such by structure
-    traced(f, *args)          f, traced once, with word of which arguments its results are made of
-    is_untouched()            whether neither a derivative nor a batch is being made here
-    is_traced()               whether what runs here becomes part of a program
-    is_in_batch()             whether a batch is being made here
-    forward_only(x, words)    x, of which a reverse derivative is refused in these words
-    largest_in_batch(x)       x, of which a batch has the largest, as a whole
-    in_turn(f, asked, x)      f(x), of which a batch visits only members that ask
-    or_alone(x)               x of a member of a batch, True where there is none
-    row_written(x, row, i)    x with another row, each member of a batch its own
-    block_written(x, y, i)    the same of a part along an axis
-    derivative(ways, x, dx)   values and tangents of a function that brings its derivatives, forward and reverse
-    together(f, x)            f(x), of which a batch has all values or none
+    consistent(f)             f; numbers that it compares are computed only once
+    structural(x)             x; its zeros are structural, so products with them may be left out
+    traced(f, *args)          f, traced once; reports which arguments its results depend on
+    is_untouched()            whether this code is outside derivatives and batches
+    is_traced()               whether this code is being traced
+    is_in_batch()             whether this code is inside vmap
+    forward_only(x, words)    x; reverse derivatives raise an error with these words
+    largest_in_batch(x)       x; under vmap the largest x of the batch
+    in_turn(f, asked, x)      f(x) if asked; a batch evaluates only the members that ask, one by one
+    or_alone(x)               x of a member of a batch; True without a batch
+    row_written(x, row, i)    x with row i replaced; in a batch each member has its own i
+    block_written(x, y, i)    x with a block along an axis replaced
+    derivative(ways, x, dx)   values and tangents of a function with its own derivatives, forward and reverse
+    together(f, x)            f(x); under vmap all values are batched, or none
     Bilinear(f, ...)          a product as one operation, with its transposes
     Linear(f, transposed)     a linear function as one operation, with its transpose
-    Family(members, rule)     functions of a number as one operation, with derivatives among them
-    on_host(f, like, *args)   f(*args), an array like `like`, by a function of NumPy arrays
-    plain()                   a context without all that
-    or_plain(run)             run(), or the same without all that where XLA refuses it
+    Family(members, rule)     functions of a number as one operation, whose derivatives are among them
+    on_host(f, like, *args)   f(*args), an array like `like`, computed by a function of NumPy arrays
+    plain()                   a context without kernels and without these marks
+    or_plain(run)             run(), on plain JAX if XLA refuses to compile it
 
-Each of them does nothing on plain JAX (`plain`), or what plain JAX would do, and the numbers are the same to rounding.
-What XLA makes of them is decided above, in `hhtjax.xla`.
+On plain JAX (`plain`) each of them does nothing, or what plain JAX would do. The numbers are the same to rounding. How
+XLA compiles them is decided in `hhtjax.xla`.
 
-An operation of your own takes two files: a primitive here, with its rules for derivatives and batches, and its
-lowering, in the same file where all platforms share it, in `xla/lowering.py` where the CPU has another.
+A new operation needs a primitive here, with its rules for derivatives and batches, and a lowering. The lowering is in
+the same file if all platforms share it, and in `xla/lowering.py` if the CPU has its own.
 """
 
 from hhtjax.primitives.atomic_functions import Bilinear as Bilinear

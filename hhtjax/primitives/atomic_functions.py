@@ -1,8 +1,8 @@
-"""Functions that stay one operation, whatever becomes of them.
+"""Functions that stay a single operation of the program under autodiff and vmap.
 
-Autodiff writes a function out anew wherever it differentiates it, and once more in all that it keeps; vmap writes it
-again. Of an operation they ask for nothing but its rule, and what it computes is written when the program is. Of all
-that JAX traced for the gradient of a chain of bodies, a quarter had been finite rotations and cross products.
+Autodiff and vmap write out the operations of a function again each time they transform it. For a primitive they only
+use its rule; its operations are written once, when the program is lowered. This saves tracing: finite rotations and
+cross products had been a quarter of all operations that JAX traced for the gradient of a chain of bodies.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """The function (n, x) -> the first n members of a family at a floating array x, a tuple.
+    """The function (n, x) -> (the first n functions of a family at a floating array x), a tuple, as one operation.
 
     Attributes:
-        members: n, x -> the tuple, each like x, element by element.
-        rule: this function, n, x, dx -> values and tangents, tuples, by other members.
+        members: (n, x) -> the tuple; each entry is like x and computed elementwise.
+        rule: (this function, n, x, dx) -> tuples of values and tangents, computed with other members of the family.
 
     >>> waves = Family(
     ...     lambda n, x: tuple(jnp.sin(x + k * jnp.pi / 2) for k in range(n)),
@@ -61,12 +61,12 @@ class Family:
 
 @dataclass(frozen=True, eq=False)
 class Bilinear:
-    """The bilinear function f of two arrays, each with as many leading axes more as the other.
+    """The bilinear function f of two arrays as one operation. Both arrays have the same number of leading batch axes.
 
     Attributes:
-        f: x, y -> z, for any number of leading axes.
-        first: z, y -> x, the transpose of x -> f(x, y).
-        second: x, z -> y, that of y -> f(x, y).
+        f: (x, y) -> z, for any number of leading axes.
+        first: (z, y) -> x, the transpose of x -> f(x, y).
+        second: (x, z) -> y, the transpose of y -> f(x, y).
 
     >>> inner = Bilinear(
     ...     lambda x, y: jnp.sum(x * y, axis=-1), lambda z, y: z[..., None] * y, lambda x, z: z[..., None] * x)
@@ -93,7 +93,7 @@ class Bilinear:
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """The linear function f of an array, with any number of leading axes more, whose transpose is known.
+    """The linear function f of an array as one operation, with its transpose, for any number of leading batch axes.
 
     Attributes:
         f: x -> y.
@@ -127,7 +127,7 @@ class Linear:
 
 
 def _is_one(*arrays: Array) -> bool:
-    """Not where types say how arrays are spread over devices: each operation of JAX has a rule for that."""
+    """Whether to use one operation: not if types say how arrays are distributed over devices (needs JAX's rules)."""
     return is_on() and not any(map(_is_spread, map(jax.typeof, arrays)))
 
 

@@ -1,4 +1,4 @@
-"""A row written into an array, each member of a batch its own: part of a kernel, where a scatter would be none."""
+"""Operations on single members of a batch inside a kernel: writing a row, and evaluating members one by one."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ if TYPE_CHECKING:
 
 
 def row_written(array: Array, row: Array, number: Array) -> Array:
-    """The array (K, ...) with the row (...) in the place of that of a number, 0 to K - 1.
+    """The array (K, ...) with one row replaced by `row` (...).
 
-    In place, if nothing else needs the old array. Of `lax.dynamic_update_index_in_dim` vmap makes a scatter, even for
-    one number that all members share.
+    The array is changed in place if nothing else needs the old one. Under vmap `lax.dynamic_update_index_in_dim`
+    becomes a scatter, even if all members share the number. This function does not, so it can be part of a kernel.
 
     Args:
         array: (K, ...).
         row: (...).
-        number: an integer scalar.
+        number: index of the row, 0 to K - 1, an integer scalar.
 
     Returns:
         An array like the one given.
 
     Raises:
-        TypeError: shapes or types do not fit.
+        TypeError: shapes or types do not match.
 
     >>> print(jax.vmap(row_written)(jnp.zeros((2, 3)), jnp.array([1.0, 2.0]), jnp.array([0, 2])))
     [[1. 0. 0.]
@@ -51,13 +51,14 @@ def row_written(array: Array, row: Array, number: Array) -> Array:
 
 
 def block_written(array: Array, block: Array, number: Array, axis: int = 0) -> Array:
-    """The array with a block in the place of what stands there along an axis from a number on; as `row_written`.
+    """The array with a part along an axis replaced by `block`; otherwise as `row_written`.
 
     Args:
-        array: of any shape.
-        block: of the same, but for its length along the axis.
-        number: an integer scalar; a block that would stand out is put at the end.
-        axis: one of the array's.
+        array: an array of any shape.
+        block: an array of the same shape, except for its length along the axis.
+        number: index along the axis at which the block begins, an integer scalar. A block that would exceed the array
+            is moved to its end.
+        axis: an axis of the array.
 
     Returns:
         An array like the one given.
@@ -158,13 +159,13 @@ mlir.register_lowering(write_p, mlir.lower_fun(written, multiple_results=False),
 
 
 def in_turn(f: Callable, asked: Array, carry: PyTree, *more: PyTree):
-    """f(carry, *more), which leaves the carry as it is where not `asked`: a batch visits only members that ask.
+    """f(carry, *more) if `asked`, otherwise the carry. In a batch only the members that ask are evaluated, one by one.
 
-    One after the other, so that a member takes what it takes alone: for what few of them need at a time, with long
-    chains of scalars. Derivatives are those of f, for the whole batch at once.
+    Each of them takes as long as it would alone. Use it for long chains of scalar operations that few members need at a
+    time. Derivatives are those of f, for the whole batch at once. f must return the carry unchanged if not `asked`.
 
     Args:
-        f: a function of pytrees of arrays that returns one like the carry.
+        f: a function of pytrees of arrays that returns a pytree like the carry.
         asked: a boolean scalar.
         carry, *more: pytrees of arrays.
 
@@ -172,7 +173,7 @@ def in_turn(f: Callable, asked: Array, carry: PyTree, *more: PyTree):
         f(carry, *more).
 
     Raises:
-        TypeError: f returns something else than the carry is. Whatever f raises.
+        TypeError: f returns a pytree unlike the carry. Whatever f raises.
 
     >>> def halved(x):
     ...     return in_turn(lambda x: jnp.where(x > 1, x / 2, x), x > 1, x)
@@ -208,7 +209,7 @@ def _evaluated(closed: ClosedJaxpr, *args: Array):
 
 
 class _Own(NamedTuple):
-    """What a member has of an array of the whole batch."""
+    """The part of an array of the whole batch that belongs to one member."""
 
     array: Array
     member: Array
@@ -237,7 +238,7 @@ def _apply(eqn: JaxprEqn, values: list):
 
 
 def _one_by_one(closed: ClosedJaxpr, mapped: list, number: int, *args):
-    """For each member that asks, as the last argument says; mapped: which of the others differ between members."""
+    """Evaluates each member that asks, by the last argument. mapped: which other arguments differ between members."""
     *args, asked = args
     numbers = jnp.arange(asked.size, dtype=jnp.int32)
 
@@ -290,7 +291,7 @@ def _jvp_turns(args: tuple, dots: tuple, *, at_once: ClosedJaxpr, **params: PyTr
 
 
 def _needed(used: list, *more: JaxprEqn):
-    """Without what nobody uses of the carry, and what only that is made from."""
+    """Removes unused entries of the carry, and operations that only they need."""
     eqn = more[-1]  # a newer JAX tells more
     if eqn.effects:
         return [True] * len(eqn.invars), eqn

@@ -1,4 +1,4 @@
-"""Whether the machinery is on: with the versions of JAX that it is tested with, and unless a user says no."""
+"""Whether kernels are made: only with tested versions of JAX, and not if the user asks for plain JAX."""
 
 from __future__ import annotations
 
@@ -25,12 +25,14 @@ _key: Any = jax.make_user_context(default_value=False)
 
 @contextmanager
 def plain():
-    """Everything inside runs on plain JAX: for who doubts a number, or looks for the cause of one.
+    """A context in which everything runs on plain JAX. Use it to check a result, or to find the cause of a problem.
 
-    Functions traced inside are kept apart from those traced outside, so a jitted function gives the plain result inside
-    and the fast one outside; of several threads it holds for the one that is inside. The environment variable
-    HHTJAX_PLAIN=1, set before the first run, does the same for a whole process. So does a JAX newer than those tested,
-    with a warning, unless HHTJAX_PLAIN=0 tries the fast way all the same. `explain` tells which way was taken, and why.
+    A jitted function gives the plain result inside and the fast one outside: both programs are kept apart. With several
+    threads the context applies to the thread that has entered it.
+
+    The environment variable HHTJAX_PLAIN=1, set before the first run, does the same for a whole process. With a JAX
+    newer than the tested ones everything runs on plain JAX too, with a warning, unless HHTJAX_PLAIN=0 is set. `explain`
+    shows whether a run is plain, and why.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> ball = hhtjax.System(mass=jnp.array([1.0, 2.0]), force=lambda q, v, t, c: -9.81 - c * v)
@@ -50,21 +52,21 @@ def plain():
 
 
 def or_plain(run: Callable, known_by: Callable | None = None):
-    """run(), or the same on plain JAX where XLA refuses what the machinery has made of it; a warning says so.
+    """run(), and if XLA refuses to compile it, run() on plain JAX, with a warning.
 
-    The last resort of programs that start here: inside a jit of the user's, XLA is not asked before he has left it.
-    `hhtjax.xla.Programs` do so by themselves.
+    It cannot help inside a user's jit, because XLA compiles only after that jit has been traced. `hhtjax.xla.Programs`
+    use it automatically.
 
     Args:
         run: a function without arguments.
-        known_by: a function without arguments; what it returns, run is known by: refused once, it is not tried again.
-            It is called after a refusal only.
+        known_by: a function without arguments that returns a key for run. A run whose key has been refused once is not
+            tried again. known_by is called only after a refusal.
 
     Returns:
-        What run returns.
+        The result of run.
 
     Raises:
-        jax.errors.JaxRuntimeError: XLA refuses the plain program too, or the machinery is off. And whatever run raises.
+        jax.errors.JaxRuntimeError: XLA refuses the plain program too, or kernels are off. And whatever run raises.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> float(hhtjax.primitives.or_plain(lambda: jnp.sum(jnp.ones(3))))
@@ -84,12 +86,15 @@ def or_plain(run: Callable, known_by: Callable | None = None):
     if known_by is not None:
         _refused.add(known_by())
     words = (str(refusal).splitlines() or [""])[0][:200]
-    _warn(f"XLA refused the fast program ({words}), so it was run on plain JAX; `with hhtjax.plain():` spares the try.")
+    _warn(
+        f"XLA refused the fast program ({words}), so it was run on plain JAX. To avoid the attempt, use "
+        "`with hhtjax.plain():`."
+    )
     return result
 
 
 def _warn(words: str):
-    """At the line outside this library, and outside what it calls others through, that led here."""
+    """Warns at the innermost line outside this library and outside the packages in BETWEEN."""
     frame, level = sys._getframe(), 1
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in BETWEEN:
         frame, level = frame.f_back, level + 1
@@ -97,7 +102,7 @@ def _warn(words: str):
 
 
 def why_off():
-    """Why the machinery is off, in words; None where it is on."""
+    """Why kernels are off, in words; None if they are on."""
     if _plain.get():
         return "inside hhtjax.plain()"
     wish = os.environ.get(VARIABLE, "")
@@ -111,19 +116,19 @@ def why_off():
 
 
 def _too_new() -> str:
-    """In words, which a warning says as well, once in a process."""
+    """The reason in words. It is also given as a warning, once in a process."""
     newest = ".".join(map(str, NEWEST))
-    why = f"JAX {jax.__version__} is newer than {newest}, the last one tested; {VARIABLE}=0 tries it all the same"
+    why = f"JAX {jax.__version__} is newer than {newest}, the last one tested; {VARIABLE}=0 tries it nevertheless"
     if not _told and jax.default_backend() == "cpu":  # elsewhere plain JAX is what runs in any case
         _told.append(why)
         _warn(
             f"hhtjax runs on plain JAX: the same numbers, several times slower. {why} (an environment variable). "
-            f"A newer hhtjax may know this JAX; 'jax<{NEWEST[0]}.{NEWEST[1] + 1}' is one that is known; {VARIABLE}=1 "
-            "takes plain JAX without this warning."
+            f"Install a newer hhtjax that supports this JAX, or 'jax<{NEWEST[0]}.{NEWEST[1] + 1}'. Set {VARIABLE}=1 to "
+            "use plain JAX without this warning."
         )
     return why
 
 
 def is_on() -> bool:
-    """Whether the machinery may change how a program runs."""
+    """Whether kernels are on, so that programs may be changed."""
     return why_off() is None

@@ -1,13 +1,12 @@
-"""Functions in which a number that is compared is the number that is used.
+"""Functions whose results do not depend on rounding differences between two evaluations of the same number.
 
-XLA evaluates what is cheap anew for each of its users, and LLVM rounds a product and a sum together where it likes. So
-of one number the program may hold two, which differ in the last place, and x == max(x) may hold for no element of x.
-JAX's derivative of a maximum counts these elements: it becomes 0/0, or, of a maximum of two, 0. So the numbers that are
-asked for equality are `held`: computed once, for all who use them. `lax.optimization_barrier` does not do this: on the
-CPU XLA drops it before it fuses.
+XLA may evaluate a cheap number again for each of its users, and LLVM may round a product and a sum together. So a
+program can have two values of one number, which differ in the last place. Then x == max(x) may be false for every
+element of x. JAX's derivative of a maximum counts the elements for which it is true. The derivative becomes 0/0, or 0
+for a maximum of two numbers. Therefore numbers that are tested for equality are `held`: computed once for all their
+users. `lax.optimization_barrier` does not achieve this, because XLA:CPU removes it before fusion.
 
-Comparisons by order, x < y, are left alone: where two roundings of x differ in that, either answer is right to
-rounding.
+Comparisons by order, x < y, are not changed. If two roundings of x give different answers, both are right to rounding.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ REBUILT = {"cond", "scan", "while"}
 
 
 def held(x: Real) -> Array:
-    """The array x, computed once for all that use it; its tangent is left alone.
+    """The array x, computed once for all its users. Its tangent is not changed.
 
     >>> print(held(jnp.arange(2.0)))
     [0. 1.]
@@ -65,13 +64,13 @@ def held(x: Real) -> Array:
 
 
 def consistent(f: Callable):
-    """f, of which values and derivatives do not depend on how often XLA evaluates what is compared in it.
+    """f with values and derivatives that do not depend on how often XLA evaluates the numbers compared in it.
 
     Args:
-        f: a function of pytrees of arrays, to one.
+        f: a function of pytrees of arrays that returns a pytree of arrays.
 
     Returns:
-        A function with the same values; f itself on plain JAX, and what is traced the same where f compares nothing.
+        A function with the same values. On plain JAX it is f itself. If f compares nothing, its trace is that of f.
 
     Raises:
         whatever f raises, when it is called.
@@ -119,7 +118,7 @@ def _held_where(hold, variables: list, values: list):
 
 
 def _to_hold(jaxpr: Jaxpr):
-    """Variables from which come, by exact operations, the numbers that are asked for equality."""
+    """The variables from which the numbers tested for equality follow by exact operations."""
     hold = set()
     for eqn in reversed(jaxpr.eqns):
         name = eqn.primitive.name
@@ -144,12 +143,12 @@ def _inner(eqn: JaxprEqn):
 
 
 def _asks(jaxpr: Jaxpr) -> bool:
-    """Whether it asks floating numbers for equality."""
+    """Whether an operation tests floating numbers for equality."""
     return _has(EQUALITIES, jaxpr)
 
 
 def _compares(jaxpr: Jaxpr) -> bool:
-    """The same, its derivatives included."""
+    """Whether an operation, or its derivative, tests floating numbers for equality."""
     return _has(EQUALITIES | CHOICES, jaxpr)
 
 

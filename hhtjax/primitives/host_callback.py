@@ -1,7 +1,7 @@
-"""A function of NumPy arrays inside a program: `jax.pure_callback` without copies of what it is given.
+"""A function of NumPy arrays inside a program, like `jax.pure_callback`, but without copies of its arguments.
 
-Those take longer than many a solve: with 1e5 numbers a call costs 0.3 ms here and 1 ms there, with 300 some 10 and 300
-microseconds.
+The copies would take longer than many solves. With 1e5 numbers a call costs 0.3 ms here and 1 ms by
+`jax.pure_callback`; with 300 numbers, some 10 and 300 microseconds.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from hhtjax.primitives.two_mode_derivative import batch_size
 
 
 def on_host(f: Callable, like: PyTree, *args: Real) -> Array:
-    """f(*args), an array like `like`, computed by f on NumPy arrays each time the program comes there.
+    """f(*args), an array like `like`, computed by a function f of NumPy arrays whenever the program gets there.
 
-    Of a batch all members are handed over at once: every argument then has a leading axis, of length 1 where it has no
-    batch, and so has the result. Without derivatives.
+    A batch is passed to f as a whole. Then every argument has a leading axis, of length 1 if it is not batched, and the
+    result has one too. There are no derivatives.
 
     Args:
-        f: a function of NumPy arrays, that may be called more often than needed, or not at all.
-        like: a `jax.ShapeDtypeStruct`.
+        f: a function of NumPy arrays. It may be called more often than needed, or not at all.
+        like: a `jax.ShapeDtypeStruct` of the result.
         *args: arrays.
 
     Returns:
-        The array.
+        The result of f, as an array.
 
     Raises:
         jax.errors.JaxRuntimeError: f raises.

@@ -1,4 +1,4 @@
-"""A traced function, evaluated anew with other values than arrays."""
+"""Evaluation of traced functions with values other than arrays."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 def evaluate(jaxpr, values: Sequence, apply: Callable, of_literal: Callable = lambda x: x):
     """The values of a jaxpr's results.
 
-    values: of its constants and arguments; apply: (operation, values) -> values of its results; of_literal: number in
-    the program -> value.
+    values: values of its constants and arguments. apply: (operation, values) -> values of its results. of_literal: a
+    number in the program -> its value.
     """
     known = dict(zip([*jaxpr.constvars, *jaxpr.invars], values, strict=True))
 
@@ -36,7 +36,7 @@ def evaluate(jaxpr, values: Sequence, apply: Callable, of_literal: Callable = la
 
 
 def needed(jaxpr):
-    """The operations that the results come from: what nobody asks for may have no derivative."""
+    """The operations on which the results depend. Others may have no derivative, and must not be evaluated."""
     wanted, found = {x for x in jaxpr.outvars if not isinstance(x, Literal)}, []
     for eqn in reversed(jaxpr.eqns):
         if eqn.effects or not wanted.isdisjoint(eqn.outvars):
@@ -67,8 +67,8 @@ class Traced(NamedTuple):
     """A function that has been traced; made by `traced`.
 
     Attributes:
-        jaxpr: it as a program of JAX.
-        constants: what it closes over.
+        jaxpr: the function as a jaxpr.
+        constants: the values that it closes over.
         result: shapes and dtypes of its results.
     """
 
@@ -81,13 +81,13 @@ class Traced(NamedTuple):
         return jax.tree.unflatten(jax.tree.structure(self.result), found)
 
     def reads(self, needed: list | None):
-        """Which of the arrays in its arguments it makes those of its results from that are needed: lists of booleans.
+        """Which arrays in the arguments the needed results depend on: lists of Booleans.
 
         Args:
-            needed: for each array in the results; None: all.
+            needed: a Boolean for each array in the results; None: all are needed.
 
         Returns:
-            For each array in the arguments.
+            A Boolean for each array in the arguments.
 
         Raises:
             AssertionError: there are fewer or more results.
@@ -97,14 +97,14 @@ class Traced(NamedTuple):
 
 
 def traced(f: Callable, *like: PyTree) -> Traced:
-    """f, traced once, of arguments like these, without operations that no result is made of.
+    """Traces f once for arguments like these, and removes operations on which no result depends.
 
-    XLA would drop these too, but not from what it computes once, such as a stage, nor from the tracing and lowering
-    before it. Each operation keeps the line that it comes from, which an inlined jit forgets.
+    XLA would remove them too, but not from a stage, and only after they have been traced and lowered. Each operation
+    keeps the source line from which it comes. An inlined jit would lose it.
 
     Args:
         f: a function of pytrees of arrays.
-        *like: these, or tracers of theirs.
+        *like: such pytrees, or tracers of them.
 
     Returns:
         `Traced`, a function with the same values.

@@ -1,8 +1,7 @@
-"""A function that may become one kernel, as one operation of JAX with a jaxpr in it: `kernel_p`.
+"""A function that may become one kernel, as one operation of JAX that contains its jaxpr: `kernel_p`.
 
-Autodiff and vmap keep the operation and transform its jaxpr, each by JAX's own transformation of that jaxpr. So when
-the program is lowered the whole function is there to be looked at, with all that autodiff and vmap have made of it;
-what is then done with it is in lowering.py.
+Autodiff and vmap keep the operation and transform its jaxpr, by JAX's own transformations. So when the program is
+lowered, the whole function can be examined, after autodiff and vmap. lowering.py then decides what to do with it.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
-"""How a program says where kernels shall be: a loop as one, and a barrier that fusion does not cross.
+"""Marks in a program for its kernels: a loop that shall be one kernel, and results that shall be computed once.
 
-XLA:CPU runs a loop body as a list of kernels. Each costs a call, and so does every buffer between them: on a small
-mechanism several times what the arithmetic costs. And what is fused is evaluated anew in every user: the sines of a
-system once for every column of its Jacobian. So a loop becomes one operation here (kernel_primitive.py), which autodiff
-and vmap keep, and functions get names. When the program is lowered, with vmap and autodiff done, lowering.py decides.
+XLA:CPU runs a loop body as a list of kernels. Each kernel costs a call, and each buffer between them costs time too. On
+a small mechanism this takes several times as long as the arithmetic. Also, fused operations are evaluated again for
+each
+user: the sines of a system, for example, once for every column of its Jacobian. Therefore a loop becomes one operation
+here (kernel_primitive.py), which autodiff and vmap keep, and functions get names. When the program is lowered, after
+vmap and autodiff, lowering.py decides which of them become kernels.
 """
 
 from __future__ import annotations
@@ -33,12 +35,13 @@ WRITTEN_OUT = 32  # numbers of a sum in a loop, one after the other
 
 
 def one_kernel(f: Callable, *args: PyTree, around: bool = False):
-    """f(*args) of pytrees of arrays, as one kernel where XLA can; the same values otherwise.
+    """f(*args) as one kernel if XLA can compile it so; otherwise the same values without it.
 
     Args:
         f: a function of pytrees of arrays.
-        *args: these.
-        around: whether f has kernels of its own, which it keeps where it cannot be one: `explain` tells of these.
+        *args: its arguments.
+        around: whether f contains kernels of its own. They remain if f cannot be one kernel, and `explain` reports
+            them.
 
     Returns:
         f(*args).
@@ -75,11 +78,11 @@ def _with_arguments(closed: ClosedJaxpr):
 
 
 def staged(f: Callable | Traced, size: int | None = None) -> Callable | Traced:
-    """f of pytrees of arrays; inside `one_kernel` its results are computed once, however many users they have.
+    """The function f, whose results are computed only once inside `one_kernel`, however many users they have.
 
     Args:
         f: a function of pytrees of arrays.
-        size: number of unknowns. With a single one, of which a Jacobian has one column, nothing is shared.
+        size: number of unknowns. With a single unknown a Jacobian has one column, and nothing is shared.
 
     Returns:
         A function with the same values.
@@ -94,11 +97,12 @@ def staged(f: Callable | Traced, size: int | None = None) -> Callable | Traced:
 
 
 def part(f: Callable, size: int | None = None):
-    """f of pytrees of arrays; a kernel of its own where it is in none, and XLA would take long for its fusions.
+    """The function f, which becomes a kernel of its own if it is in no other, and if compiling its fusions would be
+    slow.
 
     Args:
         f: a function of pytrees of arrays.
-        size: number of unknowns. With a single one there is a kernel around.
+        size: number of unknowns. With a single unknown f is always inside a kernel.
 
     Returns:
         A function with the same values.
@@ -113,14 +117,14 @@ def part(f: Callable, size: int | None = None):
 
 
 def choose(inside: Callable, outside: Callable, *args: PyTree) -> PyTree:
-    """inside(*args) in one kernel, outside(*args) elsewhere: two ways to the same values.
+    """inside(*args) in one kernel, outside(*args) elsewhere. Both must give the same values.
 
     Args:
         inside, outside: functions of pytrees of arrays.
-        *args: these.
+        *args: their arguments.
 
     Returns:
-        The values of both.
+        The values.
 
     Raises:
         whatever the two raise.
@@ -134,9 +138,9 @@ def choose(inside: Callable, outside: Callable, *args: PyTree) -> PyTree:
 
 
 def structural(x: np.ndarray) -> Array:
-    """The array x, whose zeros are such by structure, as in a unit vector: their products may be left out of sums.
+    """The array x with its zeros marked as structural, as in a unit vector. Products with them may be left out of sums.
 
-    So the sum of 0 y and z is z, also where y is infinite or not a number.
+    So the sum of 0 y and z is z, also if y is infinite or NaN.
 
     Args:
         x: an array.
@@ -154,18 +158,19 @@ def structural(x: np.ndarray) -> Array:
 
 
 def largest_in_batch(x: Array, kept: bool = True) -> Array:
-    """The scalar x; under vmap the largest over the members, the same for all of them.
+    """The scalar x; under vmap the largest x of the batch, which all members share.
 
-    A bound of a loop that is the same for all, or a condition: of a condition of their own vmap makes a choice, and
-    every member takes both ways in every step. Here what few members need in few steps costs nothing in the others; the
-    branch has to leave alone what members hold that have not asked for it.
+    Use it as a common bound of a loop, or as the condition of a branch. If members have different conditions, vmap
+    evaluates both branches for every member in every step. With a common condition, a branch that few members need in
+    few steps costs nothing in the other steps. The branch must not change the values of members that have not asked for
+    it.
 
     Args:
         x: an integer or boolean scalar.
         kept: False for a boolean that nothing else needs.
 
     Returns:
-        A scalar, which vmap gives no axis.
+        A scalar, without a batch axis under vmap.
 
     Raises:
         TypeError: x is no array.
@@ -178,7 +183,9 @@ def largest_in_batch(x: Array, kept: bool = True) -> Array:
 
 
 def or_alone(x: Array) -> Array:
-    """Whether a member of a batch goes on while others do; what is no member always does, and never chooses.
+    """x for a member of a batch, True without a batch: whether the member goes on while others do.
+
+    Without a batch there is nothing to select, so the condition is constant.
 
     Args:
         x: a boolean scalar, true where there is no batch.

@@ -1,9 +1,9 @@
-"""Functions with derivatives of their own in both modes: for loops that autodiff would take a long way round.
+"""Functions with derivatives of their own in forward and reverse mode, for loops that autodiff handles badly.
 
-`jax.custom_jvp` leaves reverse mode to autodiff, which cannot turn a loop of so many iterations as data say; with
-`jax.custom_vjp` there is no forward mode. Here a derivative is an operation of JAX. Forward mode evaluates it together
-with the values, in one loop; where reverse mode takes the values apart from what is linear, each becomes an operation
-of its own, and the linear one brings its transpose.
+`jax.custom_jvp` leaves reverse mode to autodiff, which cannot reverse a loop whose number of iterations depends on
+data. With `jax.custom_vjp` there is no forward mode. Here a derivative is an operation of JAX. Forward mode evaluates
+it together with the values, in one loop. Reverse mode separates the values from the linear part. Each of them becomes
+an operation of its own, and the linear one has its transpose as a rule.
 """
 
 from __future__ import annotations
@@ -24,15 +24,17 @@ from hhtjax.description import Array, PyTree
 
 
 class TwoWays(NamedTuple):
-    """A function of a list of arrays, x, and its derivative for a list of floating tangents dx, one or more, of some of
-    them; none of these closes over a tracer.
+    """A function of a list of arrays x, with its derivatives by some of them. None of the functions closes over a
+    tracer.
+
+    dx is a list of one or more floating tangents of entries of x.
 
     Attributes:
-        number: of values.
+        number: number of values.
         values: x -> list of values.
-        forward: x, dx -> values, and the list of tangents dy of the floating ones.
-        reverse: x, cotangents of dy -> those of dx.
-        slow, slow_reverse: as the last two, in forms that autodiff can differentiate.
+        forward: (x, dx) -> (values, list of the tangents dy of the floating values).
+        reverse: (x, cotangents of dy) -> cotangents of dx.
+        slow, slow_reverse: as forward and reverse, in forms that autodiff can differentiate.
     """
 
     number: int
@@ -52,12 +54,12 @@ class TwoWays(NamedTuple):
 
 
 def derivative(ways: TwoWays, x: list, dx: list):
-    """The values of a function and their tangents, in either mode of autodiff.
+    """The values of a function and their tangents, in forward or reverse mode.
 
     Args:
-        ways: `TwoWays`.
+        ways: a `TwoWays`.
         x: a list of arrays.
-        dx: a list of floating arrays, of those parts of x that move.
+        dx: a list of floating arrays: tangents of the entries of x that have one.
 
     Returns:
         The lists of values and of tangents.
@@ -75,10 +77,10 @@ def derivative(ways: TwoWays, x: list, dx: list):
 
 
 def together(f: Callable, x: list):
-    """f(x), lists of arrays; all of the values have a batch if part of x has it, as those of `derivative` do.
+    """f(x), a list of arrays. Under vmap all values are batched if any entry of x is, as for `derivative`.
 
     Args:
-        f: a function that closes over no tracer.
+        f: a function that does not close over a tracer.
         x: a list of arrays.
 
     Returns:
@@ -116,7 +118,7 @@ def values(*x: Array, f: Callable):
 
 
 def _jvp_by(function, args, dots, **params):
-    """Found by autodiff."""
+    """Tangents by autodiff of the function."""
     found = jax.jvp(partial(function, **params), args, tuple(map(_instantiated, args, dots)))
     return found[0], [no_tangent(x) if x.dtype == jax.dtypes.float0 else x for x in found[1]]
 
@@ -244,13 +246,13 @@ IN_PROGRAMS = (
 
 
 def is_untouched() -> bool:
-    """Whether neither a derivative nor a batch is being made here; of a jit one may be made when it has been traced.
+    """Whether this code runs outside derivatives and batches. A jit around it may still be differentiated later.
 
     Args:
         None.
 
     Returns:
-        A boolean, known while a function is being traced; False where a JAX says it in words that are not known.
+        A Boolean, known while a function is being traced; False with a JAX whose tracers are not known here.
 
     Raises:
         Nothing.
@@ -266,13 +268,13 @@ def is_untouched() -> bool:
 
 
 def is_traced() -> bool:
-    """Whether what runs here becomes part of a program, or of a derivative or a batch, in less than a microsecond.
+    """Whether this code is being traced: for a program, a derivative or a batch. It takes less than a microsecond.
 
     Args:
         None.
 
     Returns:
-        A boolean, known while a function is being traced; True where a JAX says it in words that are not known.
+        A Boolean, known while a function is being traced; True with a JAX whose tracers are not known here.
 
     Raises:
         Nothing.
@@ -298,13 +300,13 @@ def in_front(x: Array, axis: int | None, size: int) -> Array:
 
 
 def is_in_batch() -> bool:
-    """Whether a batch is being made here, as far as a JAX says so: not of a jit of which one is made when it is traced.
+    """Whether this code runs inside vmap, as far as JAX shows it. A jit around it may still be batched later.
 
     Args:
         None.
 
     Returns:
-        A boolean, known while a function is being traced.
+        A Boolean, known while a function is being traced.
 
     Raises:
         Nothing.
@@ -323,10 +325,10 @@ def is_in_batch() -> bool:
 
 
 def is_in_program() -> bool:
-    """Whether what is called here becomes part of a program: of a jit that is traced, or of reverse mode.
+    """Whether a function called here becomes part of a larger program: inside jit or reverse mode.
 
-    A jit called there may have no options for the compiler. JAX says so of reverse mode only after it has compiled, and
-    run, the forward part with them.
+    A jit called there must not have compiler options. In reverse mode JAX raises its error only after it has compiled
+    and run the forward part with them.
 
     >>> import jax
     >>> seen, x = [], jax.numpy.ones(1)
@@ -342,11 +344,11 @@ def is_in_program() -> bool:
 
 
 def forward_only(x: Array, words: str) -> Array:
-    """The array x, of which a reverse derivative is refused in these words, and not in JAX's.
+    """The array x. Reverse mode raises an error with the given words, instead of JAX's own error.
 
     Args:
         x: an array.
-        words: of the error.
+        words: text of the error.
 
     Returns:
         The same array.

@@ -1,8 +1,8 @@
-"""How a run becomes one kernel.
+"""How runs are compiled, and how to see why a run is fast or slow.
 
-On the CPU the whole loop over the steps becomes one kernel, that is, one compiled function without
-calls to others; gradients and batches too, wherever XLA can compile it so: up to 16 unknowns, without sorting,
-scattering of many numbers, LAPACK or callbacks in your functions. `explain` tells which, and why not:
+On the CPU the whole loop over the steps is compiled into one kernel, that is, one function without calls to others.
+This also holds for gradients and batches. It needs at most 16 unknowns, and functions without sorting, scattering of
+many numbers, LAPACK or callbacks. `explain` shows for each loop whether it is one kernel, and if not, why:
 
 >>> import jax.numpy as jnp, hhtjax
 >>> ball = hhtjax.System(mass=jnp.ones(2), force=lambda q, v, t, c: -9.81 - c * v)
@@ -11,44 +11,61 @@ scattering of many numbers, LAPACK or callbacks in your functions. `explain` tel
 >>> print(hhtjax.explain(fall, 0.1))  # doctest: +ELLIPSIS
 loop 1: ...
 
-A step of the double pendulum, its functions in plain `jnp` and no Jacobian written by hand, then takes about as long as
-C with everything written by hand, 40 ns, and in a batch 8 ns for each member, or 4 with vectors of 512 bits, which
-`sweep` and `jax.vmap` of `simulate` take where no jit is around them. Such runs, and fits, are compiled in half the
-time, too; inside a jit of the user's its own options hold: `jax.jit(f, compiler_options=hhtjax.xla.QUICK |
-hhtjax.xla.WIDE)` (QUICK: up to 32 unknowns, nothing since JAX 0.11.1; WIDE: batches of up to four; both for the CPU).
-Sines of float64 numbers in a kernel are polynomials, to 2 units in the last place, where XLA would call a function for
-each. The gradient of a run takes 2.7 to 3.9 times the run, in memory that grows with the square root of the number of
-steps.
-Systems of few operations are stepped number by number, not array by array, with every sine evaluated once. What is no
-single kernel runs as a list of them, several times slower, with all that the columns of a Jacobian share evaluated
-once; in a jit of the user's each stage of a step is one: the squeezing mechanism with its 19 unknowns then takes 9
-microseconds a step, its gradient 30. Jacobians keep track of what depends on
-which unknown, so that for a chain of N links, or springs between neighbours, they take N^2 numbers and not N^3; a chain
-or a tree may give the product M(q) w without M: `System(..., inertia=)`.
-Measured, against C, by structure, batches and gradients, on a page, `experiments/benchmarks/README.md`; error against
-time beside diffrax, SciPy, MuJoCo and exudyn, losses included, on another, `experiments/work_precision/README.md`.
+Speed
+-----
 
-All this may change rounding, and nothing else. Who doubts a number runs the same on plain JAX, and compares; the
-environment variable `HHTJAX_PLAIN=1` does it for a whole process. JAX 0.7.2 to 0.12 make kernels. With a newer one it
-is so from the start: a warning, once in a process, and `explain` say so (`HHTJAX_PLAIN=0` tries it all the same). A
-program that XLA refuses runs on plain JAX too, with a warning, and is not tried again.
+A step of the double pendulum as one kernel takes 40 ns, about as long as C written by hand. Its functions are plain
+`jnp`, without a Jacobian written by hand. In a batch a step takes 8 ns for each member, or 4 ns with vectors of 512
+bits. `sweep` and `jax.vmap` of `simulate` use these vectors if they are not inside a `jax.jit`. The gradient of a run
+takes 2.7 to 3.9 times as long as the run. Its memory grows with the square root of the number of steps.
+
+If a loop cannot be one kernel, it runs as a list of kernels, several times slower. Values that the columns of a
+Jacobian share are still evaluated only once. Inside your own `jax.jit` each stage of a step is then one kernel: the
+squeezing mechanism with its 19 unknowns takes 9 microseconds a step, its gradient 30.
+
+Measurements: `experiments/benchmarks/README.md` compares with C, by structure, batches and gradients.
+`experiments/work_precision/README.md` compares error and time with diffrax, SciPy, MuJoCo and exudyn, including the
+cases in which they are faster.
+
+How it is done: systems of few operations are evaluated number by number, not array by array, and every sine once. Sines
+of float64 numbers in a kernel are polynomials, accurate to 2 units in the last place, because XLA would call a function
+for each. Jacobians are computed with their sparsity: for a chain of N links, or springs between neighbours, they take
+N^2 numbers instead of N^3. A chain or a tree may give the product M(q) w without M: `System(..., inertia=)`.
+
+Compiler options
+----------------
+
+Runs and fits outside `jax.jit` are compiled with options that halve the compile time. Inside your own jit the options
+of that jit apply. You can pass the same ones: `jax.jit(f, compiler_options=hhtjax.xla.QUICK | hhtjax.xla.WIDE)`. Both
+are for the CPU. QUICK helps for systems of up to 32 unknowns; since JAX 0.11.1 it is empty. WIDE helps for batches of
+systems of up to four coordinates.
+
+Checking a result
+-----------------
+
+All this may change rounding, and nothing else. To check a result, run the same on plain JAX and compare. The
+environment variable `HHTJAX_PLAIN=1` does this for a whole process.
 
 >>> with hhtjax.plain():
 ...     expected = fall(0.1)
 >>> bool(jnp.allclose(fall(0.1), expected, rtol=1e-12))
 True
 
-The door
---------
+Kernels are made with JAX 0.7.2 to 0.12. With a newer JAX everything runs on plain JAX; a warning, once in a process,
+and `explain` say so. `HHTJAX_PLAIN=0` makes kernels nevertheless. If XLA refuses a program, it runs on plain JAX with a
+warning, and kernels are not tried again for it.
 
-    explain(f, *args)         what became of the loops of a program
-    calls(names, f, *args)    whether a program calls compiled functions of these names
+Functions
+---------
+
+    explain(f, *args)         how the loops of a program run
+    calls(names, f, *args)    whether a program calls compiled functions with these names
     polynomial_sines(x)       the sines of a kernel, for |x| <= RANGE
-    keep_programs(folder)     compiled programs on disk, for the next process
-    Programs(f)               f, compiled QUICKly, with WIDE vectors where that pays
+    keep_programs(folder)     keeps compiled programs on disk, for other processes
+    Programs(f)               f, compiled with QUICK, and with WIDE where that is faster
 
-What a program says of itself is in `hhtjax.primitives`; how its functions are evaluated number by number, and what that
-may change, in `hhtjax.jaxpr`. On plain JAX the rest of the library works as well, several times slower.
+`hhtjax.primitives` has the operations by which a program marks its parts for the compiler. `hhtjax.jaxpr` evaluates
+functions number by number. Without them, on plain JAX, the rest of the library works too, several times slower.
 """
 
 from hhtjax.primitives import plain

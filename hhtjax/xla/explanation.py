@@ -1,4 +1,4 @@
-"""What became of a run in the compiled program."""
+"""How the loops of a run are compiled."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 class Explanation(NamedTuple):
-    """What `explain` found; as text, a line for each loop.
+    """Result of `explain`; prints one line for each loop.
 
     Attributes:
-        paths: for each loop over steps "one kernel", or "plain: ", what stood against it, and where in your files.
+        paths: for each loop over steps "one kernel", or "plain: " followed by the obstacle and its line in your files.
         compile_seconds: time to compile, s.
-        temporary_bytes: memory beside arguments and results; None where XLA does not tell.
+        temporary_bytes: memory in addition to arguments and results; None if XLA does not report it.
     """
 
     paths: tuple[str, ...]
@@ -37,16 +37,21 @@ class Explanation(NamedTuple):
 
 
 def explain(f: Callable, *args: Real) -> Explanation:
-    """Compiles f(*args), which calls `simulate`, and tells how its loops over steps run.
+    """Compiles f(*args), which calls `simulate`, and reports how each of its loops over steps runs.
 
-    On the CPU each becomes one kernel if XLA can compile it so, several times faster on a small system, and a list of
-    kernels if not, as on other platforms: with LAPACK (more than 16 unknowns), sort, scatter
-    (`x.at[i].add(y)`, of `x[i]` the reverse derivative) of more than 32 numbers or of a batch with an i for each, large
-    products of matrices, a callback such as progress=True. Values differ by rounding.
-    Inside `hhtjax.plain()`, or with a JAX newer than those that this is tested with, every path is plain, and says so.
+    On the CPU a loop becomes one kernel if XLA can compile it so. For a small system this is several times faster.
+    Otherwise it runs as a list of kernels, as on other platforms; the values differ by rounding. Obstacles to a single
+    kernel are:
+
+        LAPACK, which is used for more than 16 unknowns; sort; large products of matrices;
+        scatter, `x.at[i].add(y)` or the reverse derivative of `x[i]`, of more than 32 numbers, or in a batch with
+        different i;
+        callbacks, such as progress=True.
+
+    Inside `hhtjax.plain()`, or with a JAX newer than the tested ones, every path is plain, with this as its reason.
 
     Args:
-        f: any function; a gradient or a vmap has loops of its own.
+        f: any function. Its gradient or vmap has other loops than f itself, so pass `jax.grad(f)` to see those.
         args: pytrees of arrays.
 
     Returns:
@@ -78,10 +83,10 @@ def explain(f: Callable, *args: Real) -> Explanation:
 
 
 def calls(names, f: Callable, *args: PyTree) -> bool:
-    """Whether f(*args), as it is traced, calls a compiled function of one of these names.
+    """Whether the trace of f(*args) calls a jitted function with one of these names.
 
     Args:
-        names: of functions that `jax.jit` compiles.
+        names: names of functions that are compiled by `jax.jit`.
         f: any function.
         args: pytrees of arrays.
 
@@ -98,7 +103,7 @@ def calls(names, f: Callable, *args: PyTree) -> bool:
 
 
 def _calls(names, jaxpr: Jaxpr, seen) -> bool:
-    """seen: ids of what has been looked through; a cached trace may be called often."""
+    """seen: ids of the jaxprs that have been searched already, because a cached trace may be called often."""
     if id(jaxpr) in seen:
         return False
     seen.add(id(jaxpr))

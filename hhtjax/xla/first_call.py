@@ -1,4 +1,4 @@
-"""What is done about first calls, which compile: programs are kept on disk, and who waits is told."""
+"""First calls, which compile: compiled programs are kept on disk, and a message explains a long wait."""
 
 from __future__ import annotations
 
@@ -47,31 +47,35 @@ _written: int | None = None  # programs so far; None until JAX has been asked to
 
 
 def keep_programs(folder: str | os.PathLike[str] | None, max_bytes: int = 1_000_000_000) -> Path | None:
-    """Keeps compiled programs in a folder, from where other processes load them: their first calls take half as long.
+    """Keeps compiled programs in a folder, from which other processes load them. This halves the time of first calls.
 
-    Call it before the first run. What is kept are machine instructions, found by the program, the versions of JAX and
-    XLA, and the options of the compiler: what has changed in your code is compiled anew. Tracing, in Python, remains.
+    Call it before the first run, in every process. Without this call no programs are kept. A kept program is found by
+    its operations, the versions of JAX and XLA, and the compiler options. So code that has changed is compiled again.
+    Tracing, in Python, is still needed.
 
-    This is a setting of JAX for the whole process. All programs are kept, also those of other libraries. It is off
-    until it is called, and other processes have to call it too. JAX's settings with
-    `jax_compilation_cache_dir` are the same thing without a bound.
+    This is a setting of JAX for the whole process. It also keeps the programs of other libraries. It is the same as
+    JAX's own setting `jax_compilation_cache_dir`, with a limit on the size.
 
-    Programs that have not been read for longest are deleted when the rest takes more than `max_bytes`: in this call,
-    after every 50 programs that are written, and when the process ends. Other files in the folder are left alone. Each
-    kind of processor has a folder of its own inside, because programs do not run where instructions are missing. Who
-    can write to the folder can run code in your process: do not share it with people whom you do not trust.
+    If the programs take more than `max_bytes`, those that have not been read for the longest time are deleted. This
+    happens in this call, after every 50 programs that are written, and when the process ends. Other files in the folder
+    are not touched. Each type of processor has its own subfolder, because programs may use instructions that other
+    processors lack.
+
+    Security: anybody who can write to the folder can run code in your process. Do not share it with people whom you do
+    not trust.
 
     Args:
-        folder: made where it does not exist; "~" is your home. None: JAX's settings from before the first call.
-        max_bytes: of all programs together, on disk.
+        folder: path of the folder, which is created if necessary; "~" is your home. None restores the settings of JAX
+            from before the first call.
+        max_bytes: limit on the size of all programs together, on disk.
 
     Returns:
-        The folder that holds the programs of this kind of processor; None for None.
+        The folder with the programs for this type of processor; None if `folder` is None.
 
     Raises:
-        TypeError: `folder` is no path.
-        ValueError: `max_bytes` is no positive integer.
-        OSError: the folder cannot be made, or not be written to.
+        TypeError: `folder` is not a path.
+        ValueError: `max_bytes` is not a positive integer.
+        OSError: the folder cannot be created, or cannot be written to.
 
     References:
         https://docs.jax.dev/en/latest/persistent_compilation_cache.html

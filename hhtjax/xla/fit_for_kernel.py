@@ -1,8 +1,9 @@
-"""What a jaxpr holds that cannot be part of one kernel: asked before XLA is, which would fail on the whole program.
+"""Finds operations of a jaxpr that cannot be part of one kernel. XLA would fail on the whole program because of them.
 
-XLA:CPU compiles a call that bears `xla_cpu_small_call` into one function, with all its loops, if all that is in it is
-known to the emitter of such functions. LAPACK, sorting, scattering, large sums and products are not. Names here are
-those of JAX's operations; one that is not listed is taken for unknown: slower, never wrong.
+XLA:CPU compiles a call with the attribute `xla_cpu_small_call` into one function, with all its loops, if the emitter of
+such functions supports all its operations. It does not support LAPACK, sorting, scattering, large sums and products.
+The names here are those of JAX's operations. An operation that is not listed counts as unsupported: this can make a
+program slower, but never wrong.
 """
 
 from __future__ import annotations
@@ -77,8 +78,8 @@ class _Objection(Exception):
 def verdict(jaxpr: Jaxpr, before: bool = False) -> Verdict:
     """The `Verdict` on a jaxpr, all that it calls included.
 
-    before: whether for_kernel.py has not gone through it yet. An objection is then one that this leaves, so that what
-    is hopeless need not be copied; there may be more after."""
+    before: whether the jaxpr has not been rewritten by for_kernel.py yet. Then only objections count that remain after
+    rewriting, so that hopeless cases need not be copied. The rewritten jaxpr may have more."""
     try:
         return Verdict(None, operations=sum(_count(jaxpr, MOST_OPERATIONS, before)))
     except _Objection as found:
@@ -166,7 +167,7 @@ def lengths(eqn):
 
 
 def is_of_vector(eqn) -> bool:
-    """Of a vector, batched or not: with a matrix, or another one, which is a sum. It stays in the kernel as it is."""
+    """Whether a product is that of a vector with a matrix or a vector, batched or not. It can stay in a kernel."""
     _, rows, columns = lengths(eqn)
     largest = max(x.aval.size for x in eqn.invars)
     return min(rows, columns) <= 1 and largest <= (LARGEST_SUM if max(rows, columns) <= 1 else LARGEST_MATRIX)

@@ -1,8 +1,8 @@
-"""A jaxpr as a kernel needs it: with other operations in the place of those that XLA:CPU's emitter does not know.
+"""Rewrites a jaxpr for a kernel: replaces operations that XLA:CPU's emitter of kernels does not support.
 
-Products of small matrices become sums, large sums those of parts, scatters of few windows updates, sines of float64
-numbers polynomials; of a function in two forms (`choose`) the one for kernels is taken. All else is copied as it is,
-without being traced again.
+Products of small matrices become sums; large sums become sums of partial sums; scatters of few windows become updates;
+sines of float64 numbers become polynomials. Of a function in two forms (`choose`) the one for kernels is taken. All
+other operations are copied without being traced again.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def for_kernel(closed: ClosedJaxpr) -> ClosedJaxpr:
 
 
 def for_list(closed: ClosedJaxpr, stages_are_kernels: bool) -> ClosedJaxpr:
-    """The closed jaxpr, as it is run where it is no kernel: stages are computed once, or kernels; kernels stay."""
+    """The closed jaxpr in the form of a list of kernels: stages are computed once, or become kernels; kernels stay."""
     return with_values_held(_Copier(partial(_in_list, stages_are_kernels)).copied(closed))
 
 
@@ -138,7 +138,7 @@ class _Copier:
 
 
 def _is_seldom(eqn: JaxprEqn) -> bool:
-    """A conditional on a boolean that has nothing to do where that is false, and many values to pass on."""
+    """Whether an operation is a conditional on a Boolean that does nothing if it is false, and returns many values."""
     branches = eqn.params["branches"]
     if len(branches) != 2 or len(eqn.outvars) < MANY:
         return False
@@ -146,8 +146,8 @@ def _is_seldom(eqn: JaxprEqn) -> bool:
 
 
 def _loop_at_most_once(eqn: JaxprEqn, copier) -> ClosedJaxpr:
-    """A loop in the place of a conditional: XLA copies what that passes on, in either branch; what a loop carries stays
-    where it is."""
+    """A conditional as a loop of at most one iteration. XLA copies values that a branch returns unchanged, but not
+    those that a loop carries."""
     idle, taken = (copier.copied(x) for x in eqn.params["branches"])
     passed = {x: i for i, x in enumerate(idle.jaxpr.outvars) if not isinstance(x, Literal)}
     place = [passed.get(x) for x in idle.jaxpr.invars]
@@ -170,7 +170,7 @@ _is_staged = partial(_is_named, STAGED)
 
 
 def _in_list(stages_are_kernels: bool, eqn: JaxprEqn, copier):
-    """What takes the place of an equation of a list of kernels."""
+    """The replacement of an equation in a list of kernels."""
     if _is_staged(eqn) or (stages_are_kernels and _is_named(PART, eqn)):
         found = _stage_kernel(eqn.params["jaxpr"], LEAST, LARGEST) if stages_are_kernels else None
         if found is not None or _is_staged(eqn):
@@ -180,9 +180,9 @@ def _in_list(stages_are_kernels: bool, eqn: JaxprEqn, copier):
 
 @of_jaxpr
 def _stage_kernel(closed: ClosedJaxpr, least: int, largest: int):
-    """A stage as a kernel, where it makes one, and is worth one; None of all else.
+    """A stage as a kernel, if it can be one and is large enough; otherwise None.
 
-    With sines of XLA's own: polynomials, of which a kernel takes many at a time, take longer to compile."""
+    It uses XLA's own sines. Polynomials, many of which a kernel computes at a time, would take longer to compile."""
     form = _Copier(_in_kernel).copied(closed)
     found = verdict(form.jaxpr)
     if found.objection or found.operations < least or any(x.size > largest for x in (*form.in_avals, *form.out_avals)):
@@ -191,7 +191,7 @@ def _stage_kernel(closed: ClosedJaxpr, least: int, largest: int):
 
 
 def _expanded(eqn: JaxprEqn, copier):
-    """What an operation of this package does; None of any other."""
+    """An operation of this package written out as a function; None for any other operation."""
     name, params = eqn.primitive.name, eqn.params
     if name in ("hhtjax_family", "hhtjax_bilinear", "hhtjax_map"):
         return copier.copied(params["jaxpr"])
@@ -201,7 +201,7 @@ def _expanded(eqn: JaxprEqn, copier):
 
 
 def _in_kernel(eqn: JaxprEqn, copier):
-    """What takes the place of an equation, a closed jaxpr; None where it stays."""
+    """The replacement of an equation in a kernel, a closed jaxpr; None if the equation stays."""
     name, params = eqn.primitive.name, eqn.params
     if name == "cond":
         if eqn.invars[0] is INSIDE:
@@ -285,7 +285,7 @@ def _product_of_vectors(dimension_numbers: tuple, x: Array, y: Array) -> Array:
 
 
 def _reduced(name: str, x: Array, axes: tuple) -> Array:
-    """A sum, or the like, of a large array: halves are added until it is small, or has so few terms that these are
+    """A reduction of a large array: halves are combined until it is small, or until the few remaining terms can be
     written out."""
     combine, reduction = REDUCTIONS[name]
     rest = [i for i in range(x.ndim) if i not in axes]
@@ -343,8 +343,8 @@ def _scattered(combine: Callable, dims, x: Array, indices: Array, updates: Array
 
 
 def _each_sine_once(eqns: list):
-    """The equations without sines and cosines that are there already, of the same number, and what stands for these: a
-    sine is a call, of which XLA does not see that it comes twice."""
+    """The equations without repeated sines and cosines of the same number, and the variables that replace these. XLA
+    does not recognise repeated sines, because they are calls."""
     if sum(eqn.primitive.name in SINES for eqn in eqns) < 2:
         return eqns, {}
     made, same, known, instead = [], {}, {}, {}  # variable -> the first one of its value; what makes it -> variables
@@ -510,16 +510,16 @@ def _handed_on(eqn: JaxprEqn, x: Var, new: dict) -> JaxprEqn:
 def kernel(form: ClosedJaxpr):
     """The function of a closed jaxpr as one kernel.
 
-    XLA aborts over a parameter of a kernel that nothing uses, or nothing any more once a constant is put in its place.
-    So the kernel returns a number that takes an element of each, and the values are hidden from XLA."""
+    XLA aborts if a parameter of a kernel is unused, or becomes unused when a constant replaces it. So the kernel also
+    returns a number that depends on an element of each parameter, and the values are hidden from XLA."""
     call = _one_call(form, lambda _, args: _of_each(args), inlineable="false", xla_cpu_small_call="true")
     return lambda *args: call(*lax.optimization_barrier(args))
 
 
 def as_call(closed: ClosedJaxpr) -> Callable:
-    """The function of a closed jaxpr, as one call of it: `jaxpr_as_fun` would trace every operation in it again.
+    """The function of a closed jaxpr as a single call. `jaxpr_as_fun` would trace every operation in it again.
 
-    The call is traced with zeros for results, and then holds the jaxpr in their place."""
+    The call is traced with zeros as results, which are then replaced by the jaxpr."""
     if any(x.dtype not in DTYPES for x in closed.out_avals):  # no zeros of keys
         return jaxpr_as_fun(closed)
 
@@ -534,11 +534,11 @@ def as_call(closed: ClosedJaxpr) -> Callable:
 
 
 def _one_call(closed: ClosedJaxpr, more: Callable, name: str = "kernel", **attributes: str):
-    """The function of a closed jaxpr, as a call that bears these attributes; more(results, arguments): what it returns
-    besides, for XLA alone.
+    """The function of a closed jaxpr as a call with these attributes. more(results, arguments): additional results of
+    the call, which only XLA needs.
 
-    Results that are arguments do not pass through the call: XLA:CPU may keep a parameter that a call returns where
-    another number is kept."""
+    Results that are arguments do not pass through the call, because XLA:CPU may store a parameter that a call returns
+    in the place of another number."""
     given = _passed_by(closed.jaxpr)
 
     def body(*args: Array):
@@ -563,7 +563,7 @@ def _passed_by(jaxpr: Jaxpr) -> dict:
 
 
 def _of_each(values: tuple):
-    """A sum of elements of all, and what no sum takes: to return each by itself would take a buffer each."""
+    """A sum of one element of each value, and the values that cannot be added. Returning each would take a buffer."""
     terms, rest = [], []
     for x in values:
         if x.size and x.dtype in DTYPES:
@@ -582,7 +582,8 @@ def _first(x: Array) -> Array:
 def computed_once(closed: ClosedJaxpr) -> ClosedJaxpr:
     """The closed jaxpr as a call that XLA does not inline, and so computes once, however many users its values have.
 
-    What has a single result XLA may divide among threads, and then the kernel does not link: it gets a second one."""
+    XLA may divide a call with a single result among threads, and then the kernel does not link. So it gets a second
+    one."""
     if len(_passed_by(closed.jaxpr)) == len(closed.out_avals):  # nothing to compute
         return closed
 

@@ -1,10 +1,10 @@
-"""How XLA:CPU shall cut a program into kernels, decided when it is lowered.
+"""Decides how XLA:CPU divides a program into kernels, when the program is lowered.
 
-A call that bears `xla_cpu_small_call` is compiled into one kernel, with all its loops. Such a kernel must hold only
-what its emitter knows: with LAPACK, sort, a large scatter or product, compilation fails. So the function is looked
-through first (fit_for_kernel.py), in the form that it has as a kernel (for_kernel.py), with vmap and autodiff done.
-Where something stands against it, the function runs as a list of kernels, and the functions in it that may be kernels
-are asked anew. Platforms other than the CPU never see it.
+XLA compiles a call with the attribute `xla_cpu_small_call` into one kernel, with all its loops. Compilation fails if
+the call contains operations that the emitter of such kernels does not support: LAPACK, sort, a large scatter or
+product. So the function is first brought into the form of a kernel (for_kernel.py), after vmap and autodiff, and
+checked (fit_for_kernel.py). If it contains an obstacle, it runs as a list of kernels, and the functions in it that may
+be kernels are checked one by one. On platforms other than the CPU nothing of this happens.
 """
 
 from __future__ import annotations
@@ -106,26 +106,28 @@ mlir.register_lowering(alone_p, lambda ctx, x: [mlir.ir_constant(np.bool_(True))
 
 
 # ----------------------------------------------------------------------------
-# Options for the compiler, of the programs that start here; inside a jit of the user's those of that jit hold.
+# Compiler options of programs that start here. Inside a user's jit, the options of that jit apply.
 #
-# QUICK: XLA:CPU compiles each fusion that stands outside a kernel by a pipeline of MLIR, some 10 ms for a few sums, and
-# gradients of mechanisms have hundreds; its older way, by which kernels are compiled anyway, takes a third of that. So
-# in programs without QUICK stages become kernels (lowering.py), which in those with it would take longer. What it makes
-# of the matrices of more than 32 unknowns is slower, by a fifth: runs and sweeps of such do without. Since JAX 0.11.1
-# there is no such option, and QUICK is empty. WIDE: vectors of 512 bits for loops over the members of a batch, where
-# XLA:CPU takes half of that, unless it is asked: a batch of double pendulums then takes half the time.
+# QUICK: XLA:CPU compiles each fusion outside a kernel by a pipeline of MLIR. This takes some 10 ms for a few sums, and
+# gradients of mechanisms have hundreds of fusions. The older emitter, which also compiles kernels, takes a third of
+# that time. Without QUICK stages become kernels (lowering.py), to be compiled by it; with QUICK that would take longer.
+# For matrices of more than 32 unknowns its code is slower by a fifth, so their runs and sweeps do not use QUICK. Since
+# JAX 0.11.1 there is no such option, and QUICK is empty.
 #
-# For a jit of one's own: `jax.jit(f, compiler_options=hhtjax.xla.QUICK)`, or `hhtjax.xla.QUICK | hhtjax.xla.WIDE`.
+# WIDE: vectors of 512 bits for loops over the members of a batch. By default XLA:CPU uses vectors of half this length.
+# With WIDE a batch of double pendulums takes half the time.
+#
+# For a user's jit: `jax.jit(f, compiler_options=hhtjax.xla.QUICK)`, or `hhtjax.xla.QUICK | hhtjax.xla.WIDE`.
 
 
 QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11, 1) else {}
 MOST_QUICK = 32  # rates; with 40, steps of a beam take 1.2 times as long
-WIDE = {"xla_cpu_prefer_vector_width": 512}  # bits; where a processor has none so long, nothing changes
+WIDE = {"xla_cpu_prefer_vector_width": 512}  # bits; no effect on processors without such vectors
 MOST_WIDE = 4  # coordinates; loops over more of them fit wide vectors badly: a chain of 7 takes 1.3 times as long
 
 
 class Programs:
-    """A function of arrays as programs: with options, and one to be called wherever it is.
+    """A function of arrays, compiled with options that depend on where it is called and on the size of the system.
 
     >>> twice = Programs(lambda x: 2 * x)
     >>> float(twice(2.0)), float(twice(3.0, rates=2, numbers=2)), float(jax.jit(twice)(3.0))
@@ -143,8 +145,11 @@ class Programs:
         programs.update((self.usual, self.quick, self.wide))
 
     def of(self, rates: int = 0, numbers: int | None = None):
-        """The one for a system of so many rates, 0 where nothing is known of one. numbers: in the position of a member
-        of a batch, None where members come one by one."""
+        """The program for a system.
+
+        rates: number of rates of the system, 0 if unknown. numbers: number of coordinates of a member of a batch; None
+        without a batch.
+        """
         if Programs.are_refused or rates > MOST_QUICK or not is_on() or jax.default_backend() != "cpu":
             return self.usual
         if is_in_program():
@@ -152,7 +157,7 @@ class Programs:
         return self.wide if numbers is not None and numbers <= MOST_WIDE else self.quick
 
     def __call__(self, *args: PyTree, rates: int = 0, numbers: int | None = None, **keywords: PyTree):
-        """The values of the function; from plain JAX where XLA refuses the program, or has done so before."""
+        """The values of the function. They come from plain JAX if XLA refuses the program, or has refused it before."""
 
         def known_by():  # what JAX keeps the program by, and what is being made of it
             made = frozenset(type(x) for x in jax.tree.leaves((args, keywords)) if not is_concrete(x))
@@ -161,11 +166,11 @@ class Programs:
         return or_plain(partial(self._chosen, lambda program: program(*args, **keywords), rates, numbers), known_by)
 
     def lower(self, *args: PyTree, rates: int = 0, numbers: int | None = None, **keywords: PyTree):
-        """What a call hands to XLA, as `jax.jit(f).lower`."""
+        """The lowered program of a call, as `jax.jit(f).lower`."""
         return self._chosen(lambda program: program.lower(*args, **keywords), rates, numbers)
 
     def exported(self, *args: PyTree, rates: int = 0, numbers: int | None = None, **keywords: PyTree):
-        """The same in a form that crosses to other processes (`jax.export`), and the options to compile it with."""
+        """The program in a form that can be sent to other processes (`jax.export`), and its compiler options."""
 
         def use(program):
             options = {id(self.wide): QUICK | WIDE, id(self.quick): QUICK, id(self.usual): {}}

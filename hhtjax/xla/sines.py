@@ -1,7 +1,8 @@
-"""Sines and cosines of a kernel, by polynomials: XLA:CPU calls a function for each float64 number, one by one.
+"""Sines and cosines in a kernel, by polynomials. XLA:CPU would call a function for each float64 number, one by one.
 
-Sine and cosine together take 2 ns in the place of 8, and batches are vectorised. The polynomials hold for |x| <= RANGE;
-where some number of a batch is larger, infinite or none, a branch takes XLA's own, so that every x has its sine.
+With polynomials sine and cosine together take 2 ns instead of 8, and batches are vectorised. They are valid for
+|x| <= RANGE. If any number of a batch is larger, infinite or NaN, a branch uses XLA's own functions, so that the result
+is right for every x.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ COSINE = (
 
 
 def polynomial_sines(x: Array, stage: Callable = lambda f: f):
-    """(sin x, cos x) for float64 numbers |x| <= RANGE, to 2 units in the last place; beyond, what has no meaning.
+    """(sin x, cos x) for float64 numbers |x| <= RANGE, to 2 units in the last place. Beyond RANGE results are invalid.
 
         x = k pi/2 + r,  |r| <= pi/4,    sin r = r + r^3 S(r^2),    cos r = 1 - r^2/2 + r^4 C(r^2)
 
@@ -54,7 +55,7 @@ def polynomial_sines(x: Array, stage: Callable = lambda f: f):
 
     Args:
         x: rad, an array.
-        stage: what makes of a function one whose results are computed once.
+        stage: a transformation of functions after which their results are computed only once, as `staged`.
 
     Returns:
         Two arrays like x.
@@ -73,8 +74,10 @@ def polynomial_sines(x: Array, stage: Callable = lambda f: f):
 
 
 def _sines_by_bits(x: Array, stage: Callable):
-    """The same by the bits of k: half the operations after the polynomials. Where operations are listed, or evaluated
-    on scalars, there are no bits."""
+    """`polynomial_sines` by the bits of k, with half the operations after the polynomials.
+
+    It cannot be used where operations are listed or evaluated on scalars, which have no bits.
+    """
     k, sine, cosine = _of_quarter(x, stage)
     bits = _bits(k + ONES)
     odd = lax.ne(bits & 1, jnp.int64(0))
