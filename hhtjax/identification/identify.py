@@ -225,6 +225,7 @@ def multistart(
     segments: int = SEGMENTS,
     executor: Executor | None = None,
     chunk: int = 1,
+    progress: bool = False,
 ) -> Multistart:
     """`fit` from several starts at once, vectorised, or by the workers of an executor.
 
@@ -235,6 +236,8 @@ def multistart(
             `fit`.
         executor: whose workers fit, as for `parallel_map`; the call has to stand outside jit.
         chunk: with an executor, starts in a task. Those of a chunk are iterated as long as the last of them needs.
+        progress: show the iteration and the lowest cost so far in one line on stderr; with an executor, a bar of the
+            chunks that are done.
 
     Returns:
         A `Multistart`.
@@ -254,7 +257,7 @@ def multistart(
     require_leading_axis("multistart", "`starts`", starts)
     first = jax.tree.map(lambda x: x[0], starts)
     options = check_options(
-        "multistart", first, optimizer, transforms, loss, max_iterations, covariance, segments, False
+        "multistart", first, optimizer, transforms, loss, max_iterations, covariance, segments, progress
     )
     check_transforms("multistart", transforms, starts, "starts")
     data = _check_data("multistart", first, scale, weights, prior, tolerance)
@@ -262,8 +265,8 @@ def multistart(
     if executor is None:
         every = jax.vmap(lambda start: solve(residuals, options, start, data))(starts)
     else:
-        fits = _Starts(residuals, options, jax.tree.structure((data, starts)))
-        every = _by_workers(fits, data, starts, executor, chunk)
+        fits = _Starts(residuals, options._replace(progress=""), jax.tree.structure((data, starts)))
+        every = _by_workers(fits, data, starts, executor, chunk, progress)
     failed = (every.code == BAD_START) | (every.code == NO_INFLUENCE) | jnp.isnan(every.cost)
     cost = jnp.where(failed, jnp.inf, every.cost)
     best = jax.tree.map(lambda x: x[jnp.argmin(cost)], every)
@@ -284,12 +287,12 @@ class _Starts:
         return jax.vmap(lambda start: solve.usual(self.residuals, self.options, start, data))(starts)
 
 
-def _by_workers(fits: _Starts, data: Data, starts: PyTree, executor: Executor, chunk: int) -> FitResult:
+def _by_workers(fits: _Starts, data: Data, starts: PyTree, executor: Executor, chunk: int, progress: bool) -> FitResult:
     if not all_concrete((data, starts)):
         raise TypeError(
             "multistart: with an `executor`, all arguments must be known: call it outside jit, vmap and grad."
         )
-    hands = require_executor("multistart", executor)
+    hands = require_executor("multistart", executor, progress=progress)
     shared, own = [sent(x) for x in jax.tree.leaves(data)], [np.asarray(x) for x in jax.tree.leaves(starts)]
     chunks = Chunks.of(len(own[0]), require_integer("multistart", "chunk", chunk))
     work = Work(fits, shared, lambda members: [x[members] for x in own], chunks, {})

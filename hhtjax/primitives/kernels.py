@@ -161,7 +161,7 @@ def largest_in_batch(x: Array, kept: bool = True) -> Array:
     branch has to leave alone what members hold that have not asked for it.
 
     Args:
-        x: an integer or boolean scalar.
+        x: an integer or boolean scalar, or another one that no derivative is taken of.
         kept: False for a boolean that nothing else needs.
 
     Returns:
