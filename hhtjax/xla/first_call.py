@@ -233,7 +233,7 @@ class _Clock:
             return
         self.is_shown = True
         with suppress(OSError, ValueError):  # the terminal is gone
-            second = 0
+            second = -1
             while not self.over.is_set() and self.is_needed():
                 if self.seconds() >= second + 1:
                     second = int(self.seconds())
