@@ -98,6 +98,12 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
+@pytest.fixture(autouse=True)
+def _without_tqdm(monkeypatch):
+    """Bars are the same here, whatever else is installed."""
+    monkeypatch.setattr("hhtjax.runs.progress._tqdm", lambda: None)
+
+
 def pytest_collection_finish(session):
     """Tracing makes many objects and hardly a circle; to look for these took a twentieth of the time. They are looked
     for where programs are forgotten."""

@@ -214,14 +214,17 @@ def test_stability_region_of_kims_step(alpha):
 
 
 @pytest.mark.parametrize(("stepper", "order"), [(hhtjax.hht(-0.05), 2), (hhtjax.kim_hht(-0.1), 1)])
-def test_observed_order(stepper, order):
+def test_observed_order(stepper, order, capsys):
     run = partial(analysis.observed_order, SPRING, stepper, jnp.ones(1), jnp.zeros(1), duration=2.0)
     against, alone = run(num_steps=(400, 600, 1600), reference=np.cos([2.0])), run(num_steps=(400, 800, 1600))
     np.testing.assert_allclose(against.slope, order, atol=0.03)
     np.testing.assert_allclose(alone.slope, order, atol=0.03)
     np.testing.assert_allclose(against.dt, [2 / 400, 2 / 600, 2 / 1600])
     assert alone.error.shape == (2,)
-    assert run(num_steps=(400, 600), reference=np.cos([2.0])).slope == pytest.approx([order], abs=0.03)
+    assert not capsys.readouterr().err
+    found = run(num_steps=(400, 600), reference=np.cos([2.0]), progress=True)
+    assert "] observed_order: step size 2 of 2, 600 steps" in capsys.readouterr().err
+    assert found.slope == pytest.approx([order], abs=0.03)
     assert alone.error[0] + alone.error[1] == pytest.approx(against.error[0] - against.error[2], rel=1e-6)
 
 

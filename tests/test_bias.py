@@ -30,14 +30,16 @@ def through(stepper, dt):
 
 
 @pytest.mark.slow
-def test_predicted_bias_is_measured_and_taken_back():
+def test_predicted_bias_is_measured_and_taken_back(capfd):
     """Data without noise, w h = 0.35, alpha = -0.05: bias to 3 % of itself, a named warning, then next to none.
 
     Numerical damping adds an error of h^3: so there are three fits, of which two alone would not take it out.
     """
     stepper = hhtjax.hht(alpha=-0.05, linearize="predictor")
     with pytest.warns(StepSizeWarning, match=r"steps of 0.35 shift c \(.*k \(\+\d.* standard errors"):
-        refined = hhtjax.refine(through, {"k": 1.2, "c": 0.1}, stepper, 0.35)
+        refined = hhtjax.refine(through, {"k": 1.2, "c": 0.1}, stepper, 0.35, progress=True)
+    shown = capfd.readouterr().err
+    assert [shown.count(x) for x in ("refine: fit 3 of 3, with steps of 0.0875 s", "converged")] == [1, 3]
     assert (refined.stepper, refined.dt) == (stepper, 0.35)
     found, fine, finest = refined.fits
     bias = hhtjax.step_size_bias(spring, stepper, found.params, 0.35, q=jnp.zeros(1), correct=True)

@@ -217,19 +217,21 @@ def test_the_same_model_is_the_same_unit(unit):
     assert token.findall(other.description) != token.findall(unit.description)
 
 
-def test_without_a_compiler_there_are_sources_and_a_warning(unit, tmp_path, monkeypatch):
+def test_without_a_compiler_there_are_sources_and_a_warning(unit, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.warns(UserWarning, match="no C compiler found"):
-        path = unit.write(tmp_path)
+        path = unit.write(tmp_path, progress=True)
+    assert "export_fmu: compiling driven.c" in capsys.readouterr().err
     names = zipfile.ZipFile(path).namelist()
     assert "sources/driven.c" in names
     assert not [name for name in names if name.startswith("binaries/")]
 
 
-def test_params_have_numbers_and_names_as_xml_has_them():
+def test_params_have_numbers_and_names_as_xml_has_them(capsys):
     """Infinity, and a name that an output has."""
     spring = hhtjax.System(jnp.ones(1), lambda q, v, t, p: -jnp.minimum(q, p["a"]) - p["time"])
-    unit = export_fmu(spring, STEPPER, 1.0, 1.0, {"a": np.inf, "time": 2.0}, dt=DT)
+    unit = export_fmu(spring, STEPPER, 1.0, 1.0, {"a": np.inf, "time": 2.0}, dt=DT, progress=True)
+    assert "export_fmu: writing model_step" in capsys.readouterr().err
     starts = {x.attrib["name"]: x.attrib.get("start") for x in ET.fromstring(unit.description).iter("Float64")}
     outputs = dict.fromkeys(["time", "q", "v", "w", "a"])
     assert starts == outputs | {"q0": "1.0", "v0": "1.0", "a_2": "INF", "time_2": "2.0"}

@@ -1,5 +1,7 @@
 """Transforms, weights, robust losses, priors, many starts: each against an independent calculation."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -162,14 +164,22 @@ def test_a_prior_is_one_more_measurement():
 
 
 @pytest.mark.slow
-def test_many_starts_find_the_lowest_minimum():
-    """One of them is none, which inside vmap is a flag."""
+def test_many_starts_find_the_lowest_minimum(capfd):
+    """One of them is none, which inside vmap is a flag. Progress is one line for all."""
 
     def wave(frequency):
         return jnp.sin(frequency * t) - jnp.sin(6.0 * t) + 0 * jnp.log(frequency)
 
     starts = jnp.linspace(1.0, 12.0, 8).at[4].set(-1.0)
-    found = hhtjax.multistart(wave, starts, covariance=False)
+    found = hhtjax.multistart(wave, starts, covariance=False, progress=True)
+    jax.effects_barrier()
+    shown = capfd.readouterr().err
+    assert shown.count("\n") == 1
+    lowest = [float(x) for x in re.findall(r"lowest cost ([^\s;]+)", shown)]
+    assert len(lowest) == int(np.max(found.all.iterations)) + 1
+    assert lowest == sorted(lowest, reverse=True)
+    assert lowest[-1] == pytest.approx(float(found.best.cost), abs=1e-20)
+    assert shown.rstrip().endswith("; all starts have ended")
     alone = [hhtjax.fit(wave, x, covariance=False).cost for x in starts[:2]]
     np.testing.assert_allclose(found.all.cost[:2], alone, rtol=1e-9)
     assert float(found.best.params) == pytest.approx(6.0, abs=1e-6)

@@ -85,7 +85,7 @@ def test_profile_is_the_parabola_of_the_standard_error(result):
 
 
 @pytest.mark.slow
-def test_the_score_test_predicts_the_refit():
+def test_the_score_test_predicts_the_refit(capsys):
     def with_kink(params, candidates):
         return residuals(params | {"rest": (0.3,)})["y"] + (candidates["kink"] - 0.6) * jnp.maximum(x - 0.5, 0.0)
 
@@ -100,7 +100,8 @@ def test_the_score_test_predicts_the_refit():
     assert found.cost_drop[0] == pytest.approx(1 - float(both.cost / without.cost), rel=0.2)
     there = hhtjax.identification.score_test(lambda p, c: with_kink(p | {"a": p["a"] + c}, absent), without.params, 0.0)
     assert (there.statistic[0], there.estimate[0]) == (0, 0)  # what is fitted already
-    exact = hhtjax.identification.score_test(lambda p, c: p * x + c * x**2 - 2 * x, 2.0, 0.0)
+    exact = hhtjax.identification.score_test(lambda p, c: p * x + c * x**2 - 2 * x, 2.0, 0.0, progress=True)
+    assert "score_test: the residuals and their derivatives in 2 " in capsys.readouterr().err
     assert (exact.statistic[0], exact.cost_drop[0]) == (0, 0)
     twice = hhtjax.identification.score_test(lambda *x: [with_kink(*x)] * 2, without.params, absent)
     assert twice.statistic[0] == pytest.approx(found.statistic[0])  # the same errors again say nothing more

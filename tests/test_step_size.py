@@ -63,7 +63,7 @@ def test_suggested_step_of_an_explicit_method_is_a_stable_one():
 
 
 @pytest.mark.slow
-def test_a_duration_asks_for_the_error_of_the_motion():
+def test_a_duration_asks_for_the_error_of_the_motion(capsys):
     """The step at which the motion of a hardening spring is off by 2 %, whatever its mode at the start."""
     scene = duffing.hardening_spring()
     stepper = as_data(hhtjax.hht(-0.05))
@@ -83,7 +83,8 @@ def test_a_duration_asks_for_the_error_of_the_motion():
     assert error == pytest.approx(0.02, rel=0.2)
     assert "0.02 of its motion over 2 s" in found.reason
     assert len(found.modes) == 1
-    short = suggest(tolerance=0.5, duration=0.05)  # a few runs might agree by damping out the same
+    short = suggest(tolerance=0.5, duration=0.05, progress=True)  # a few runs might agree by damping out the same
+    assert "suggest_step_size: run 8, 1024 steps over 0.05 s" in capsys.readouterr().err
     assert short.reason.endswith("by runs of up to 1024 steps")
 
 

@@ -1,8 +1,10 @@
-"""One line for who waits: where a first call takes long, and nowhere else."""
+"""One line for who waits: where a first call takes long, and nowhere else; how far a call is, and how long it takes."""
 
+import io
 import logging
 import threading
 import time
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,7 @@ import pytest
 
 import hhtjax
 from hhtjax.primitives import one_kernel
+from hhtjax.runs.progress import stages
 from hhtjax.xla import Programs, first_call
 
 
@@ -113,6 +116,49 @@ def test_explain_waits_too(caplog, monkeypatch):
     assert len(told(caplog)) == 1
 
 
+class Terminal(io.StringIO):
+    """Knows what has been written to it."""
+
+    def isatty(self):
+        return True
+
+    def lines(self):
+        """Each that took the place of the one before."""
+        return [x.rstrip(" ") for x in self.getvalue().split("\r")]
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """stderr, with a logging that nobody has configured."""
+    monkeypatch.setattr("sys.stderr", Terminal())
+    monkeypatch.setattr(first_call, "LOG", logging.Logger("hhtjax"))
+    monkeypatch.setattr(first_call, "_hinted", [True])
+    return first_call.sys.stderr
+
+
+@pytest.mark.slow
+def test_in_a_terminal_the_line_counts_up_and_is_closed(terminal):
+    Programs(slow_to_trace(1.2))(jnp.ones(4))
+    at_once = terminal.lines()
+    assert at_once[:-1] == ["", "hhtjax: compiling ... (0 s)", "hhtjax: compiling ... (1 s)"]
+    assert 1.2 <= float(at_once[-1].removeprefix("hhtjax: compiled in ").removesuffix(" s\n").rstrip()) < 60
+    assert not [x for x in threading.enumerate() if x.name == "hhtjax-first-call"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("level", [logging.WARNING, logging.ERROR])
+def test_in_a_terminal_an_error_wipes_the_line_out_and_logging_keeps_it_quiet(terminal, level):
+    def refuse(x):
+        time.sleep(0.4)
+        raise ValueError("no")
+
+    first_call.LOG.setLevel(level)
+    with pytest.raises(ValueError, match="no"):
+        Programs(refuse)(1.0)
+    shown = ["", "hhtjax: compiling ... (0 s)", "", ""]
+    assert terminal.lines() == (shown if level == logging.WARNING else [""])
+
+
 @pytest.mark.slow
 def test_logging_keeps_quiet(caplog):
     with caplog.at_level(logging.ERROR, logger="hhtjax"):
@@ -130,3 +176,60 @@ def test_how_to_wait_less_is_said_once_and_where_nothing_is_kept(monkeypatch):
         assert ["keep_programs" in first_call._words() for _ in range(3)] == [True, False, False]
     finally:
         jax.config.update("jax_compilation_cache_dir", folder)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A list whose only entry is the time."""
+    now = [0.0]
+    monkeypatch.setattr("hhtjax.runs.progress.time", SimpleNamespace(monotonic=lambda: now[0]))
+    return now
+
+
+def four_things(clock):
+    """The first, which compiles, takes 10 s, the others 4 s each, and the last one fails."""
+    with stages("f", True, total=4) as tell:
+        for number, seconds in enumerate((10, 4, 4, 4), 1):
+            tell(f"thing {number}")
+            clock[0] += seconds
+        raise ArithmeticError
+
+
+def test_what_is_left_is_told_by_what_the_later_things_took(clock, capsys):
+    with pytest.raises(ArithmeticError):
+        four_things(clock)
+    shown = [x.partition("] ")[2].rstrip(" ") for x in capsys.readouterr().err.split("\r")[1:]]
+    assert shown == [
+        "f: thing 1",
+        "f: thing 2, 10 s",
+        "f: thing 3, 14 s, 8 s left",
+        "f: thing 4, 18 s, 4 s left",
+        "f: thing 4, 22 s\n",
+    ]
+
+
+def test_a_bar_of_tqdm_where_it_is_installed(clock, capsys, monkeypatch):
+    made = []
+
+    class Bar:
+        def __init__(self, total, initial, desc, bar_format):
+            made.append([(total, initial, desc)])
+
+        def set_description_str(self, text):
+            made[-1].append((self.n, text))
+
+        def close(self):
+            made[-1].append("closed")
+
+    monkeypatch.setattr("hhtjax.runs.progress._tqdm", lambda: Bar)
+    with pytest.raises(ArithmeticError):
+        four_things(clock)
+    (told,) = made
+    assert told[0] == (4, 0, "f: thing 1")
+    assert told[3:] == [
+        (2, "f: thing 3, 14 s, 8 s left"),
+        (3, "f: thing 4, 18 s, 4 s left"),
+        (3, "f: thing 4, 22 s"),
+        "closed",
+    ]
+    assert not capsys.readouterr().err

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.checks import require_number, require_params
 from hhtjax.description import PyTree, Real
 from hhtjax.description.presentation import shown
+from hhtjax.runs.progress import stages
 from hhtjax.steppers.stepper import Stepper, begun, require_stepper
 from hhtjax.systems.initial_conditions import initial_values
 from hhtjax.systems.system import AnySystem
@@ -45,6 +46,7 @@ def observed_order(
     num_steps: Real,
     reference: PyTree = None,
     t0: Real = 0.0,
+    progress: bool = False,
 ) -> ObservedOrder:
     """Order of convergence of q at t0 + duration, from one run for each entry of `num_steps`.
 
@@ -53,6 +55,7 @@ def observed_order(
         duration: s. num_steps: increasing integers, such as (100, 200, 400).
         reference: exact q at the end, like q0. Without it, the change from each run to the next replaces the error. It
             has the same slope, and there is one fewer. num_steps must then be a geometric sequence.
+        progress: shows a bar in one line on stderr, with the step size of the current run.
 
     Returns:
         An `ObservedOrder`. Slopes are dlog(error)/dlog(dt). They are meaningful where dt resolves the motion and the
@@ -89,10 +92,11 @@ def observed_order(
         )
     params = require_params("observed_order", params)
     q0, v0, z0 = initial_values("observed_order", system, q0, v0, z0)
-    ends = [
-        np.asarray(_end(system, stepper, q0, v0, params, z0, float(t0), float(duration) / n, n))
-        for n in counts.tolist()
-    ]
+    ends = []
+    with stages("observed_order", progress, int(counts.sum())) as tell:
+        for number, n in enumerate(counts.tolist(), 1):
+            tell(f"step size {number} of {len(counts)}, {n} steps", work=n)
+            ends.append(np.asarray(_end(system, stepper, q0, v0, params, z0, float(t0), float(duration) / n, n)))
     if reference is None:
         error = np.array([np.linalg.norm(x - y) for x, y in pairwise(ends)])
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.analysis.amplification import damping_ratio, eigenvalues, period_elongation
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real, freeze
+from hhtjax.runs.progress import stages
 from hhtjax.steppers.stepper import Stepper, begun, require_capable, require_stepper
 from hhtjax.systems.constraints import acceleration_and_multipliers, jacobian
 from hhtjax.systems.flat_system import flatten
@@ -93,6 +95,7 @@ def suggest_step_size(
     highest: Real = None,
     duration: Real = None,
     t0: Real = 0.0,
+    progress: bool = False,
 ) -> StepSize:
     """Suggests a step size that resolves the modes of the system, and lists the numerical error of each mode.
 
@@ -124,6 +127,7 @@ def suggest_step_size(
         tolerance: in (0, 1).
         highest: largest frequency to be resolved, rad/s; None for all modes.
         duration: duration of the runs, s; not together with `highest`.
+        progress: with `duration`, shows in one line on stderr which run is being made.
 
     Returns:
         A `StepSize`, which prints as a table.
@@ -173,7 +177,9 @@ def suggest_step_size(
         linear = isinstance(system, LinearSystem) and system.nonlinear is None
         dt, reason = _modal_step(rates, resolved, stable, tolerance, highest, linear)
     else:
-        dt, most = step_size_by_runs(system, stepper, q0, v0, params, z0, float(t0), float(duration), tolerance)
+        given = system, stepper, q0, v0, params, z0, float(t0), float(duration), tolerance
+        with stages(caller, progress) as tell:
+            dt, most = step_size_by_runs(*given, tell)
         reason = f"keeps q within {tolerance:g} of its motion over {duration:g} s, by runs of up to {most} steps"
 
     modes = []
@@ -269,21 +275,29 @@ def step_size_by_runs(
     t0: Real,
     duration: Real,
     tolerance: Real,
+    tell: Callable,
 ):
     """The largest step from which on the error of q stays within the tolerance, and the steps of the finest run.
 
     The error is the RMS difference of q from the finest run, relative to the RMS of q about its mean. Halving ends when
     two runs in a row are within the tolerance, because a single one could agree by chance. It also goes on to a run of
     at least ENOUGH steps, because coarse runs agree if the method damps the same vibration out of all of them.
+    tell: of `stages`.
 
     Raises:
         ValueError: more than MOST steps would be needed.
     """
     run = partial(_samples, system, stepper, q0, v0, params, z0, t0, duration)
-    counts, paths = [FEWEST], [np.asarray(run(FEWEST))]
+    counts, paths = [], []
+
+    def add(n: int):
+        tell(f"run {len(counts) + 1}, {n} steps over {duration:g} s")
+        counts.append(n)
+        paths.append(np.asarray(run(n)))
+
+    add(FEWEST)
     while counts[-1] < MOST:
-        counts.append(2 * counts[-1])
-        paths.append(np.asarray(run(counts[-1])))
+        add(2 * counts[-1])
         errors = _errors_of_runs(counts, paths, stepper.order)
         good = np.append(errors <= tolerance, True)
         first = len(good) - int(np.argmin(good[::-1])) if not good.all() else 0

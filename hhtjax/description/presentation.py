@@ -6,6 +6,7 @@ Nothing here computes with JAX, because a result may hold tracers, or be printed
 from __future__ import annotations
 
 import html
+import shutil
 import sys
 from typing import Any, NamedTuple, TypeVar
 
@@ -140,5 +141,22 @@ def as_html(table: Table) -> str:
 
 
 def overwrite(line: str, last: bool):
-    """Writes a line to stderr that replaces the previous one, in a terminal and in a notebook; the last one stays."""
-    print(f"\r{line:<79}", end="\n" if last else "", file=sys.stderr, flush=True)
+    """Writes a line to stderr that replaces the previous one, in a terminal and in a notebook; the last one stays.
+
+    An empty line erases it.
+    """
+    if sys.stderr is None:  # of a program without a console
+        return
+    width = shutil.get_terminal_size().columns - 1 if is_terminal() else 79
+    line = line if last else line[:width]  # one that is longer cannot be rewritten
+    end = "\n" if last else "" if line else "\r"
+    sys.stderr.write(f"\r{line:<{width}}{end}")
+    sys.stderr.flush()
+
+
+def is_terminal() -> bool:
+    """Whether stderr is a terminal, and not a file, a pipe or a notebook."""
+    try:
+        return sys.stderr.isatty()
+    except (AttributeError, ValueError):  # there is none, or it is closed
+        return False

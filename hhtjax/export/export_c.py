@@ -28,6 +28,7 @@ from hhtjax.export.model import (
 )
 from hhtjax.export.statements import NotWritten, Statements
 from hhtjax.jaxpr import Listing, NotListed, listed
+from hhtjax.runs.progress import stages
 from hhtjax.steppers.stepper import Stepper
 from hhtjax.systems.system import AnySystem
 
@@ -76,6 +77,7 @@ class ExportedC:
 def export_c(
     system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree = None, params: PyTree = None, *,
     z0: PyTree = None, name: str = "model", sensitivities: tuple = (), units: dict | None = None,
+    progress: bool = False,
 ) -> ExportedC:  # fmt: skip
     """Exports the step of a system as C99 without dependencies, for hard real time.
 
@@ -111,6 +113,7 @@ def export_c(
             state has dq_dk, dv_dk, ... They assume that q0 and v0 do not depend on the params.
         units: units of fields, for comments in the header: {"q": "rad", "k": "N m/rad"}. A name also applies to all
             fields that begin with it, as "q" for q_arm, unless they have an entry of their own.
+        progress: shows in one line on stderr which function is being written.
 
     Returns:
         An `ExportedC`; its `write(folder)` writes both files.
@@ -130,7 +133,8 @@ def export_c(
     >>> print(model.header.splitlines()[-7])
     spring_API int spring_step(spring_state *s, const spring_params *p, const spring_real *u, spring_real dt);
     """
-    return exported("export_c", system, stepper, q0, v0, params, z0, name, sensitivities, units)
+    with stages("export_c", progress) as tell:
+        return exported("export_c", system, stepper, q0, v0, params, z0, name, sensitivities, units, tell)
 
 
 def exported(
@@ -144,8 +148,9 @@ def exported(
     name: str,
     sensitivities: tuple,
     units: dict | None,
+    tell: Callable,
 ) -> ExportedC:
-    """`export_c`, with error messages that begin with the name of the caller."""
+    """`export_c`, with error messages that begin with the name of the caller. tell: of `stages`."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise ValueError(f"{caller}: `name` must be one that C allows, such as 'pendulum'; received {name!r}.")
     if name.lower() in files.TAKEN:
@@ -161,7 +166,10 @@ def exported(
         after = state, numbers.values, u, u, t
         layout = Layout.of(made, state)
         code = _Code(name, made, numbers, layout, rows, names, state)
-        texts = [code.begin(functions[0], start), code.step(functions[1], after)]
+        tell(f"writing {name}_init")
+        texts = [code.begin(functions[0], start)]
+        tell(f"writing {name}_step")
+        texts.append(code.step(functions[1], after))
     except NotListed as error:
         where = "" if error.line is None else f"; it is used in {error.line}"
         raise NotImplementedError(f"{caller}: `{error.name}` cannot be written in C{where}.") from None
@@ -170,6 +178,7 @@ def exported(
     units = units_of(caller, units, [*code.fields, *numbers.fields, *numbers.inputs])
     told = [*texts, code.factors] if code.factors else texts
     helpers = sorted({x for text in told for x in text.helpers}, key=str)
+    tell(f"writing {name}.c")
     parts = files.Parts(name, made, stepper, code.fields, numbers, units, texts, code.factors, helpers, code.counts)
     return ExportedC(
         name, files.header(parts), files.source(parts), tuple(code.fields), tuple(numbers.fields),

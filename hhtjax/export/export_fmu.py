@@ -24,6 +24,7 @@ from hhtjax.export.export_c import ExportedC, exported
 from hhtjax.export.fmi3 import wrapper
 from hhtjax.export.model import distinct, fields
 from hhtjax.export.statements import number
+from hhtjax.runs.progress import stages
 from hhtjax.steppers.stepper import Stepper
 from hhtjax.systems.system import AnySystem
 
@@ -73,10 +74,12 @@ class ExportedFMU:
     description: str = entry(repr=False)
     wrapper: str = entry(repr=False)
 
-    def write(self, folder) -> Path:
+    def write(self, folder, progress: bool = False) -> Path:
         """Writes name.fmu into a folder, with sources and a binary for this platform. Returns its path.
 
         Without a C compiler (cc, gcc or clang) it warns, and the unit contains only the sources.
+
+        progress: shows in one line on stderr that the sources are being compiled.
         """
         folder, name = Path(folder), self.c.name
         folder.mkdir(parents=True, exist_ok=True)
@@ -87,7 +90,9 @@ class ExportedFMU:
             "sources/buildDescription.xml": build,
         }  # fmt: skip
         system = platform.system().lower()
-        binary = _binary(name, {path: str(text) for path, text in files.items()})
+        with stages("export_fmu", progress) as tell:
+            tell(f"compiling {name}.c")
+            binary = _binary(name, {path: str(text) for path, text in files.items()})
         if binary is None:
             warnings.warn(f"export_fmu: no C compiler found: {name}.fmu contains sources, but no binary.", stacklevel=2)
         else:
@@ -117,6 +122,7 @@ def _binary(name, files):
 def export_fmu(
     system: AnySystem, stepper: Stepper, q0: PyTree, v0: PyTree = None, params: PyTree = None, *,
     z0: PyTree = None, dt: Real, name: str = "model", sensitivities: tuple = (), units: dict | None = None,
+    progress: bool = False,
 ) -> ExportedFMU:  # fmt: skip
     """Exports a system as a functional mock-up unit (FMI 3.0, Co-Simulation), for Simulink, OpenModelica, Dymola, ...
 
@@ -134,11 +140,11 @@ def export_fmu(
     a step sets a flag, the unit returns fmi3Error. To go on, call `fmi3Reset` or restore an earlier state.
 
     Args:
-        system, stepper, q0, v0, params, z0, name, sensitivities, units: as in `export_c`.
+        system, stepper, q0, v0, params, z0, name, sensitivities, units, progress: as in `export_c`.
         dt: step size, s.
 
     Returns:
-        An `ExportedFMU`; its `write(folder)` writes name.fmu.
+        An `ExportedFMU`; its `write(folder)` compiles it and writes name.fmu.
 
     Raises:
         NotImplementedError, ValueError, TypeError: as `export_c`; dt is not positive.
@@ -153,7 +159,8 @@ def export_fmu(
     <Float64 name="k" valueReference="7" causality="parameter" variability="tunable" start="4.0"/>
     """
     require_number("export_fmu", "dt", dt, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
-    c = exported("export_fmu", system, stepper, q0, v0, params, z0, name, sensitivities, units)
+    with stages("export_fmu", progress) as tell:
+        c = exported("export_fmu", system, stepper, q0, v0, params, z0, name, sensitivities, units, tell)
     starts = [(key, x) for key, x in (("q0", q0), ("v0", v0), ("z0", z0)) if x is not None]
     begin = [field for key, x in starts for field in fields(x, key, key)]
     begin_units = {field.name: c.units.get(re.sub("^([qvz])0", r"\1", field.name)) for field in begin}

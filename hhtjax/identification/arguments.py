@@ -48,7 +48,7 @@ class Options(NamedTuple):
     max_iterations: int
     covariance: bool
     segments: int
-    progress: bool
+    progress: str  # whose fits to show, "fit" or "multistart"; "" for none
 
 
 @cache
@@ -97,7 +97,7 @@ def check_options(
     max_iterations = require_integer(caller, "max_iterations", max_iterations)
     segments = require_integer(caller, "segments", segments, 2)
     rho = LOSSES.get(loss) if isinstance(loss, str) else loss
-    return Options(optimizer, transforms, rho, max_iterations, covariance, segments, progress)
+    return Options(optimizer, transforms, rho, max_iterations, covariance, segments, caller if progress else "")
 
 
 def check_parameters(caller: str, params0: PyTree, name: str = "params0"):

@@ -232,6 +232,7 @@ def multistart(
     segments: int = SEGMENTS,
     executor: Executor | None = None,
     chunk: int = 1,
+    progress: bool = False,
 ) -> Multistart:
     """Runs `fit` from several initial guesses at once: vectorised, or on the workers of an executor.
 
@@ -242,6 +243,8 @@ def multistart(
             `fit`.
         executor: its workers run the fits, as for `parallel_map`. The call must be outside jit.
         chunk: number of starts in each task of the executor. All starts of a task iterate until the slowest has ended.
+        progress: shows the iteration and the lowest cost so far in one line on stderr; with an executor, a bar of the
+            finished tasks.
 
     Returns:
         A `Multistart`.
@@ -262,7 +265,7 @@ def multistart(
     require_leading_axis("multistart", "`starts`", starts)
     first = jax.tree.map(lambda x: x[0], starts)
     options = check_options(
-        "multistart", first, optimizer, transforms, loss, max_iterations, covariance, segments, False
+        "multistart", first, optimizer, transforms, loss, max_iterations, covariance, segments, progress
     )
     check_transforms("multistart", transforms, starts, "starts")
     data = _check_data("multistart", first, scale, weights, prior, tolerance)
@@ -270,8 +273,8 @@ def multistart(
     if executor is None:
         every = jax.vmap(lambda start: solve(residuals, options, start, data))(starts)
     else:
-        fits = _Starts(residuals, options, jax.tree.structure((data, starts)))
-        every = _by_workers(fits, data, starts, executor, chunk)
+        fits = _Starts(residuals, options._replace(progress=""), jax.tree.structure((data, starts)))
+        every = _by_workers(fits, data, starts, executor, chunk, progress)
     failed = (every.code == BAD_START) | (every.code == NO_INFLUENCE) | jnp.isnan(every.cost)
     cost = jnp.where(failed, jnp.inf, every.cost)
     best = jax.tree.map(lambda x: x[jnp.argmin(cost)], every)
@@ -292,12 +295,12 @@ class _Starts:
         return jax.vmap(lambda start: solve.usual(self.residuals, self.options, start, data))(starts)
 
 
-def _by_workers(fits: _Starts, data: Data, starts: PyTree, executor: Executor, chunk: int) -> FitResult:
+def _by_workers(fits: _Starts, data: Data, starts: PyTree, executor: Executor, chunk: int, progress: bool) -> FitResult:
     if not all_concrete((data, starts)):
         raise TypeError(
             "multistart: with an `executor`, all arguments must be known: call it outside jit, vmap and grad."
         )
-    hands = require_executor("multistart", executor)
+    hands = require_executor("multistart", executor, progress=progress)
     shared, own = [sent(x) for x in jax.tree.leaves(data)], [np.asarray(x) for x in jax.tree.leaves(starts)]
     chunks = Chunks.of(len(own[0]), require_integer("multistart", "chunk", chunk))
     work = Work(fits, shared, lambda members: [x[members] for x in own], chunks, {})

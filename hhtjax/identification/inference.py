@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_function, require_integer, require_number
 from hhtjax.description import PyTree, Real, freeze, thaw
-from hhtjax.description.presentation import overwrite, shown
+from hhtjax.description.presentation import shown
 from hhtjax.identification import transforms as tf
 from hhtjax.identification.evidence import count, residuals_of
 from hhtjax.identification.gauss_newton import with_jacobian
@@ -22,6 +22,7 @@ from hhtjax.identification.identify import fit
 from hhtjax.identification.residuals import spread_weights
 from hhtjax.identification.result import FitResult
 from hhtjax.identification.sandwich import SEGMENTS, in_segments, in_time
+from hhtjax.runs.progress import stages
 
 if TYPE_CHECKING:
     from hhtjax.identification.sandwich import Uncertainty
@@ -48,7 +49,12 @@ class Score(NamedTuple):
 
 
 def score_test(
-    residuals: Callable[[Any, Any], Any], params: PyTree, candidates: Any, segments: int = SEGMENTS
+    residuals: Callable[[Any, Any], Any],
+    params: PyTree,
+    candidates: Any,
+    segments: int = SEGMENTS,
+    *,
+    progress: bool = False,
 ) -> Score:
     """Tests which additional terms a model needs, from one Jacobian, without fitting the terms.
 
@@ -63,6 +69,7 @@ def score_test(
         params: parameters fitted without the candidates. candidates: the values at which the terms are absent, usually
             zeros.
         segments: number of segments.
+        progress: shows in one line on stderr what is being computed.
 
     Returns:
         A `Score`.
@@ -92,8 +99,10 @@ def score_test(
     )
     both, unravel = ravel_pytree((params, candidates))
     p = ravel_pytree(params)[0].size
-    shapes = [x.shape for x in jax.tree.leaves(jax.eval_shape(lambda x: residuals(*thaw(unravel(x))), both))]
-    r, J = with_jacobian(lambda x: ravel_pytree(residuals(*thaw(unravel(x))))[0], both)
+    with stages("score_test", progress) as tell:
+        tell(f"the residuals and their derivatives in {both.size} parameters and candidates")
+        shapes = [x.shape for x in jax.tree.leaves(jax.eval_shape(lambda x: residuals(*thaw(unravel(x))), both))]
+        r, J = jax.block_until_ready(with_jacobian(lambda x: ravel_pytree(residuals(*thaw(unravel(x))))[0], both))
     Q, _ = jnp.linalg.qr(J[:, :p])
     X = J[:, p:] - Q @ (Q.T @ J[:, p:])
     rounding = 10 * len(r) * float(jnp.finfo(r.dtype).eps) * jnp.linalg.norm(J[:, p:], axis=0)
@@ -283,21 +292,21 @@ def _leave_out(name: str, result: FitResult, function: Callable, folds: int, alw
     judges = [np.asarray((w != 0) & (y == 0)) for w, y in zip(weights, always, strict=True)]
     cuts = [[_segment(x.shape, folds, fold) & x for x in judges] for fold in range(folds)]
     cuts = [out for out in cuts if any(map(np.any, out))]
-    for number, out in enumerate(cuts, 1):
-        if progress:
-            overwrite(f"compare: {name}, segment {number} of {len(cuts)} left out", last=number == len(cuts))
-        kept = [np.where(x, 0, w) for x, w in zip(out, weights, strict=True)]
-        again = fit(
-            function,
-            thaw(result.params),
-            transforms=structure.unflatten(result.transforms),
-            weights=structured.unflatten(kept),
-            covariance=False,
-            **options,
-        )
-        left = [np.where(x, w, 0) for x, w in zip(out, weights, strict=True)]
-        judged = residuals_of(again._replace(weights=structured.unflatten(left)))
-        square = sum(np.sum(r**2) for r in judged.weighted)
-        errors.append(math.sqrt(square / count(judged)))
-        converged.append(bool(again.converged))
+    with stages("compare", progress, len(cuts)) as tell:
+        for number, out in enumerate(cuts, 1):
+            tell(f"{name}, segment {number} of {len(cuts)} left out")
+            kept = [np.where(x, 0, w) for x, w in zip(out, weights, strict=True)]
+            again = fit(
+                function,
+                thaw(result.params),
+                transforms=structure.unflatten(result.transforms),
+                weights=structured.unflatten(kept),
+                covariance=False,
+                **options,
+            )
+            left = [np.where(x, w, 0) for x, w in zip(out, weights, strict=True)]
+            judged = residuals_of(again._replace(weights=structured.unflatten(left)))
+            square = sum(np.sum(r**2) for r in judged.weighted)
+            errors.append(math.sqrt(square / count(judged)))
+            converged.append(bool(again.converged))
     return errors, converged

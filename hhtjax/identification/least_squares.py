@@ -15,10 +15,12 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import Array, Real
-from hhtjax.description.presentation import overwrite, shown
+from hhtjax.description.presentation import shown
 from hhtjax.identification.gauss_newton import deviation, or_one
 from hhtjax.identification.losses import Objective
 from hhtjax.numerics.array_namespace import namespace_of, select, while_loop, with_entry
+from hhtjax.primitives import largest_in_batch
+from hhtjax.runs.progress import rewrite
 
 if TYPE_CHECKING:
     from hhtjax.identification.gauss_newton import Dense, DenseTrial
@@ -45,7 +47,7 @@ def levenberg_marquardt(
     longest: np.ndarray,
     tolerance: Real,
     max_iterations: Real,
-    progress: bool,
+    progress: str,
     room: int | None = None,
     enough: Callable | None = None,
 ):
@@ -94,7 +96,7 @@ def levenberg_marquardt(
         taken = xp.where(lower & ~first, xp.max(xp.abs(step)), 0)
         history = record(history, iteration, best.cost, taken, course.lam)
         if progress:
-            show(iteration, best.cost, taken, code)
+            show(progress, (iteration, best.cost, taken, code), (now.cost, carry[-1]))
         return best, course, iteration, history, code
 
     # nothing is known before the first evaluation, which is that of the loop: f is compiled once
@@ -198,7 +200,7 @@ SMALL = 0.1  # standard errors
 
 
 def in_rounds(
-    problem_for: Callable, x: Array, longest: np.ndarray, tolerance: Array, max_iterations: int, progress: bool
+    problem_for: Callable, x: Array, longest: np.ndarray, tolerance: Array, max_iterations: int, progress: str
 ):
     """`levenberg_marquardt` in rounds; also returns the number of rounds with frozen steps.
 
@@ -266,7 +268,7 @@ class Smooth(NamedTuple):
 
 
 def descend(
-    problem: Smooth, x: Array, optimizer, tolerance: Array, max_iterations: int, progress: bool, patience: int = 5
+    problem: Smooth, x: Array, optimizer, tolerance: Array, max_iterations: int, progress: str, patience: int = 5
 ):
     """Minimises the cost of a `Smooth` problem by an optax optimiser; returns the best point of all iterations."""
     import optax  # where a fit needs it: see `for_many`
@@ -278,7 +280,8 @@ def descend(
         return carry[-1] == RUNNING
 
     def improve(carry: tuple):
-        x, state, best, before, step, quiet, iteration, history, _ = carry
+        x, state, best, before, step, quiet, iteration, history, ended = carry
+        lowest = best[1]
         value, gradient = jax.value_and_grad(problem.cost)(x)
         best = jax.tree.map(partial(jnp.where, value < best[1]), (x, value), best)
         history = record(history, iteration, value, step, None)
@@ -289,7 +292,7 @@ def descend(
         code = jnp.where(jnp.all(gradient == 0), level, code)
         code = jnp.where(jnp.isfinite(value), code, jnp.where(iteration == 0, BAD_START, STUCK))
         if progress:
-            show(iteration, value, step, code)
+            show(progress, (iteration, value, step, code), (lowest, ended))
         updates, state = optimizer.update(gradient, state, x, value=value, grad=gradient, value_fn=problem.cost)
         updates = jnp.where(code == RUNNING, jnp.asarray(updates), 0)
         iteration = jnp.where(code == RUNNING, iteration + 1, iteration)
@@ -347,15 +350,35 @@ def record(history: History, i: Real, *values):
     return History(*(None if x is None else with_entry(x, i, y) for x, y in zip(history, values, strict=True)))
 
 
-def show(iteration, cost, step, code):
-    """A line on stderr, the same one at every iteration; at the end with the reason."""
+def show(caller: str, now: tuple, before: tuple):
+    """A line on stderr, the same one at every iteration; at the end with the reason. Of `multistart`, one for all.
+
+    now: iteration, cost, step, code. before: the lowest cost and the code until then, which fits that have ended keep.
+    """
 
     def tell(iteration, cost, step, code):
         what = f"step {float(step):.3g}" if step else "no step" if iteration else "start"
         what = what if code == RUNNING else REASONS[int(code)]
-        overwrite(f"fit: iteration {int(iteration)}, cost {float(cost):.9g}, {what}", last=code != RUNNING)
+        words = f"fit: iteration {int(iteration)}, cost {float(cost):.9g}, {what}"
+        rewrite(words, code != RUNNING, int(iteration))
 
-    if namespace_of(cost) is np:
-        tell(iteration, cost, step, code)
+    def tell_of_all(iteration, lowest, is_over):
+        what = "; all starts have ended" if is_over else ""
+        rewrite(f"{caller}: iteration {int(iteration)}, lowest cost {float(lowest):.9g}{what}", is_over, int(iteration))
+
+    if namespace_of(now[1]) is np:
+        tell(*now)
+    elif caller == "multistart":
+        jax.debug.callback(tell_of_all, *of_all(now, before))
     else:
-        jax.debug.callback(tell, iteration, cost, step, code)
+        jax.debug.callback(tell, *now)
+
+
+def of_all(now: tuple, before: tuple):
+    """Iteration, lowest cost and whether all have ended, of a batch of fits. One that has ended is not changed."""
+    iteration, cost, _, code = now
+    lowest, ended = before
+    runs = ended == RUNNING
+    lowest = jnp.where(runs, jnp.fmin(cost, lowest), lowest)
+    lowest = -largest_in_batch(-jnp.where(jnp.isnan(lowest), jnp.inf, lowest))
+    return largest_in_batch(jnp.where(runs, iteration, -1)), lowest, ~largest_in_batch(runs & (code == RUNNING))

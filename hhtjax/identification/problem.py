@@ -70,7 +70,7 @@ def solve(residuals: Callable | Reading, options: Options, params0: PyTree, data
 
 
 def limits_of(options: Options, data: PyTree, x: Real):
-    """The tolerance, at least 10 roundings of numbers like x; how many iterations at most; whether to show them."""
+    """The tolerance, at least 10 roundings of numbers like x; how many iterations at most; whose to show."""
     xp, least = namespace_of(x), 10 * float(jnp.finfo(x.dtype).eps)
     return xp.maximum(xp.asarray(data.tolerance, x.dtype), least), options.max_iterations, options.progress
 

@@ -20,6 +20,7 @@ from hhtjax.identification.identifiability import parameter_names
 from hhtjax.identification.identify import fit
 from hhtjax.identification.result import NAMED, FitResult
 from hhtjax.runs.extrapolate import richardson
+from hhtjax.runs.progress import rewrite
 from hhtjax.steppers.options import Options
 from hhtjax.steppers.residual import Coefficients
 from hhtjax.steppers.rosenbrock import RosenbrockTableau
@@ -81,6 +82,8 @@ def refine(
     stepper: Stepper,
     dt: Real,
     levels: int | None = None,
+    *,
+    progress: bool = False,
     **options: Any,
 ) -> Refined:
     """Fits with step sizes dt, dt/2 and so on, and extrapolates the parameters to dt = 0.
@@ -103,6 +106,7 @@ def refine(
         stepper: passed to residuals_at. Its order and damping determine the extrapolation.
         dt: step size of the first fit, s.
         levels: number of fits, at least 2. None: 3 with numerical damping, otherwise 2.
+        progress: shows on stderr which fit is running, and below it the progress line of that fit.
 
     Returns:
         A `Refined`.
@@ -139,7 +143,10 @@ def refine(
     levels = needed_levels(stepper) if levels is None else require_integer("refine", "levels", levels, 2)
     fits = []
     for level in range(levels):
-        fits.append(fit(residuals_at(stepper, dt / 2**level), fits[-1].params if fits else params0, **options))
+        if progress:
+            rewrite(f"refine: fit {level + 1} of {levels}, with steps of {dt / 2**level:.6g} s", last=True)
+        start = fits[-1].params if fits else params0
+        fits.append(fit(residuals_at(stepper, dt / 2**level), start, progress=progress, **options))
     params = richardson([freeze(result.params) for result in fits], stepper.order)
     shift = jax.tree.map(
         lambda p, q, e: (p - q) / jnp.where(e > 0, e, jnp.inf),

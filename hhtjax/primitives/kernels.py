@@ -166,7 +166,7 @@ def largest_in_batch(x: Array, kept: bool = True) -> Array:
     it.
 
     Args:
-        x: an integer or boolean scalar.
+        x: an integer or boolean scalar, or another one that no derivative is taken of.
         kept: False for a boolean that nothing else needs.
 
     Returns:

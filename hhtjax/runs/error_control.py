@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 
 from hhtjax.description import Array, PyTree, is_concrete
-from hhtjax.description.presentation import overwrite, shown
+from hhtjax.description.presentation import shown
 from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.approximate_math import approximate_exp, approximate_log, without_rounding
 from hhtjax.numerics.batched_cond import call_where_alone, tree_where
@@ -21,7 +21,7 @@ from hhtjax.runs.driver import before_any, flaw_at_start, neutral_info, no_failu
 from hhtjax.runs.event_step import SHORT, EventContext, SubStep, asks, pass_events, reaching
 from hhtjax.runs.interpolate import kept, output_between, solution_at, with_output
 from hhtjax.runs.output import output_at_start
-from hhtjax.runs.progress import announce, steps_between
+from hhtjax.runs.progress import announce, rewrite, steps_between
 from hhtjax.runs.solution import EVENTS, FINE, MANY, SimulationError, first_bad
 from hhtjax.steppers.stepper import entered, join_info, step_start
 from hhtjax.steppers.variable_step import resized_step
@@ -503,7 +503,7 @@ def show(share, over):
 
     def bar(share, over):
         done = int(100 * min(float(share), 1.0))
-        overwrite(f"[{'#' * (done * 40 // 100):<40}] {done} % of the time", last=bool(over))
+        rewrite(f"{done} % of the time", bool(over), done, 100)
 
     jax.debug.callback(bar, share, over)
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from hhtjax.checks import require_integer
 from hhtjax.description import PyTree, is_array
-from hhtjax.runs.progress import bar
+from hhtjax.runs.progress import bar, counted
 from hhtjax.runs.workers import Packed, Unfit, packed, results
 from hhtjax.xla import Programs
 
@@ -132,6 +132,8 @@ class Hands:
         waiting, flying, tries = deque(these), {}, Counter()
         ended: SimpleQueue[Future] = SimpleQueue()
         call, total, done = uuid.uuid4().hex, len(waiting), 0
+        if self.progress:
+            bar(done, total, "chunk")
         try:
             while waiting or flying:
                 while waiting and len(flying) < self.in_flight:
@@ -231,10 +233,8 @@ def collected(work: Work, hands: Hands | None, progress: bool = False, program: 
         program = program or work.packed(hands.caller)
         hands.work(results, chunks, range(chunks.number), lambda k, ticket: (program, work.arrays(k), ticket), take)
     else:
-        for k in range(chunks.number):
+        for k in counted(range(chunks.number), progress):
             take(k, work.here(k))
-            if progress:
-                bar(k + 1, chunks.number, "chunk")
     return jax.tree.unflatten(structure, found)
 
 

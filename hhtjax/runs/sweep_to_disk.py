@@ -21,7 +21,7 @@ from hhtjax.runs.adaptive import Adaptive
 from hhtjax.runs.executors import IN_FLIGHT, RETRIES, Chunks, Work, require_executor, sent
 from hhtjax.runs.output import require_output
 from hhtjax.runs.parallel_map import work_of
-from hhtjax.runs.progress import bar
+from hhtjax.runs.progress import counted
 from hhtjax.runs.storage import INPUTS, NUMBER, Names, Npz
 from hhtjax.runs.sweep import run_sweep
 from hhtjax.runs.sweep_controlled import sweep_chosen
@@ -203,10 +203,8 @@ def _store(
         store.begin(manifest)
     left = store.left(chunks.number)
     if hands is None:
-        for done, k in enumerate(left, 1):
+        for k in counted(left, progress):
             store.write(k, chunks.kept(k), work.here(k))
-            if progress:
-                bar(done, len(left), "chunk")
     elif left:
         program = work.packed(caller)
 

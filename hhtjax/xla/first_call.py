@@ -5,11 +5,14 @@ from __future__ import annotations
 import atexit
 import hashlib
 import logging
+import multiprocessing
 import os
 import platform
 import sys
 import threading
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import wraps
 from pathlib import Path
 from types import FrameType
@@ -20,6 +23,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from hhtjax.checks import require_integer
 from hhtjax.description import PyTree
+from hhtjax.description.presentation import is_terminal, overwrite
 
 # ----------------------------------------------------------------------------
 # Compiled programs that outlive their process: JAX's cache on disk, with a bound on its size.
@@ -181,9 +185,12 @@ def _look_through():
 
 
 # ----------------------------------------------------------------------------
-# A word to who waits: one line, where JAX traces or compiles a program of ours for more than two seconds.
+# A line for who waits, where JAX traces or compiles a program of ours for more than two seconds: in a terminal the time
+# so far, else one message of `logging`.
 
 PATIENCE = 2.0  # s
+PERIOD = 0.25  # s between two looks at whether the program is done; a quarter of what the line counts in
+GOODBYE = 1.0  # s that the end of a call waits for the line to be closed
 COMPILED = "/jax/core/compile/backend_compile_duration"  # the event of JAX after a program was compiled, or loaded
 LOG = logging.getLogger("hhtjax")  # what is not configured writes to stderr
 
@@ -193,22 +200,64 @@ _watching: list[bool] = []
 
 
 class _Clock:
-    """Runs from the first sign of a program that is not compiled yet, in a thread of its own."""
+    """Runs from the first sign of a program that is not compiled yet, in a thread of its own.
+
+    Only that thread writes. The one that compiles waits for it no longer than `GOODBYE`, and holds no lock: neither can
+    block the other.
+    """
 
     def __init__(self, thread: int):
         self.thread = thread
         self.frame: FrameType | None = None  # while it is there, the program is not done
-        self.timer = threading.Timer(PATIENCE, self.ring)
-        self.timer.daemon = True
-        self.timer.start()
+        self.begun = time.monotonic()
+        self.is_compiled = self.is_shown = False
+        self.over = threading.Event()
+        self.writer = threading.Thread(target=self.run, name="hhtjax-first-call", daemon=True)
+        self.writer.start()
 
-    def ring(self):
+    def run(self):
+        """Until the program is compiled, or given up."""
+        if not self.over.wait(PATIENCE) and self.is_needed():
+            self.tell()
+        self.frame = None
+        if _clocks.get(self.thread) is self:
+            del _clocks[self.thread]
+
+    def is_needed(self) -> bool:
+        """Whether the thread still waits for the program."""
+        waited_for = self.frame
+        return waited_for is not None and any(x is waited_for for x in _stack(sys._current_frames().get(self.thread)))
+
+    def tell(self):
         """Two seconds are over."""
-        if _clocks.pop(self.thread, None) is not self:
-            return
-        waited_for, self.frame = self.frame, None
-        if waited_for is not None and any(x is waited_for for x in _stack(sys._current_frames().get(self.thread))):
+        if not _is_rewritable():
             LOG.warning(_words())
+            while not self.over.wait(PERIOD) and self.is_needed():
+                pass  # one message is enough
+            return
+        self.is_shown = True
+        with suppress(OSError, ValueError):  # the terminal is gone
+            second = -1
+            while not self.over.is_set() and self.is_needed():
+                if self.seconds() >= second + 1:
+                    second = int(self.seconds())
+                    overwrite(f"hhtjax: compiling ... ({second} s)", last=False)
+                self.over.wait(PERIOD)
+            if self.is_compiled:
+                overwrite(f"hhtjax: compiled in {self.seconds():.1f} s" + _hint(". "), last=True)
+            else:
+                overwrite("", last=False)
+
+    def seconds(self) -> float:
+        """So far."""
+        return time.monotonic() - self.begun
+
+    def stop(self, is_compiled: bool = False, is_final: bool = False):
+        """The program is done, or given up: what is written from now on begins a line."""
+        self.is_compiled = is_compiled
+        self.over.set()
+        if self.is_shown or is_final:
+            self.writer.join(GOODBYE)
 
 
 def tell_if_long():
@@ -229,7 +278,11 @@ def telling_if_long(f: Callable) -> Callable:
     @wraps(f)
     def traced(*args: PyTree, **keywords: PyTree) -> PyTree:
         tell_if_long()
-        return f(*args, **keywords)
+        try:
+            return f(*args, **keywords)
+        except BaseException:
+            _stop()
+            raise
 
     return traced
 
@@ -241,23 +294,47 @@ def _stack(frame: FrameType | None):
         frame = frame.f_back
 
 
+def _is_rewritable() -> bool:
+    """Whether a line can count up: in a terminal that no other process or thread writes such a line to, and where
+    `logging` is neither configured to take it elsewhere nor to leave it out."""
+    alone = multiprocessing.parent_process() is None and not any(x.is_shown for x in list(_clocks.values()))
+    return alone and is_terminal() and LOG.isEnabledFor(logging.WARNING) and not LOG.hasHandlers()
+
+
 def _words() -> str:
-    """The line; how to wait less is said once in a process."""
+    """The one message."""
     words = f"hhtjax: tracing or compiling a program for {PATIENCE:.3g} s by now; only its first call takes so long."
+    return words + _hint(" ")
+
+
+def _hint(before: str) -> str:
+    """How to wait less, once in a process, behind what comes before."""
     if getattr(jax.config, "jax_compilation_cache_dir") or _hinted:  # noqa: B009
-        return words
+        return ""
     _hinted.append(True)
-    return f"{words} Other processes can load it: hhtjax.keep_programs(folder)."
+    return f"{before}Other processes can load it: hhtjax.keep_programs(folder)."
 
 
-def _stop(event: str, duration_secs: float, **_: Any):
-    if event == COMPILED and (clock := _clocks.pop(threading.get_ident(), None)) is not None:
-        clock.frame = None
-        clock.timer.cancel()
+def _stop(is_compiled: bool = False):
+    """The clock of this thread, if there is one."""
+    if (clock := _clocks.pop(threading.get_ident(), None)) is not None:
+        clock.stop(is_compiled)
+
+
+def _listener(event: str, duration_secs: float, **_: Any):
+    if event == COMPILED:
+        _stop(is_compiled=True)
+
+
+def _stop_all():
+    """The interpreter ends: no thread may write any more."""
+    for clock in list(_clocks.values()):
+        clock.stop(is_final=True)
 
 
 def _watch():
     """Once in a process."""
     if not _watching:
         _watching.append(True)
-        jax.monitoring.register_event_duration_secs_listener(_stop)
+        jax.monitoring.register_event_duration_secs_listener(_listener)
+        atexit.register(_stop_all)
