@@ -228,7 +228,7 @@ def page(numbers):
             gradients=rows_table(
                 [{**r, "MB": r["temporary_bytes"] / 1e6} for r in gradients["rows"]],
                 {
-                    "": "derivative",
+                    "derivative": "derivative",
                     "us per step": "us_per_step",
                     "over the primal": "over_primal",
                     "MB": "MB",

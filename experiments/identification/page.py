@@ -45,7 +45,7 @@ def silverbox_pieces(numbers):
         "naive_least": min(naive),
         "naive_most": max(naive),
         "richardson": table(
-            ["", "k/m", "c/m"], [[n, *(f"{by[x]:.1e}" for x in ("k/m", "c/m"))] for n, by in agreement.items()]
+            ["fit", "k/m", "c/m"], [[n, *(f"{by[x]:.1e}" for x in ("k/m", "c/m"))] for n, by in agreement.items()]
         ),
     }
 
@@ -59,7 +59,7 @@ def far_table(far):
         ]
         for solver in next(iter(far.values()))
     ]
-    return table(["", *far], rows)
+    return table(["solver", *far], rows)
 
 
 def pendulum_pieces(numbers):
@@ -175,7 +175,7 @@ def tanks_pieces(numbers):
     ]
     return {
         "tanks": table(["term added", "parameters", "training", "left out", "test"], rows),
-        "tanks_estimates": table(["", "estimate", "95 % interval", "unit"], estimates),
+        "tanks_estimates": table(["parameter", "estimate", "95 % interval", "unit"], estimates),
         "tanks_chosen": numbers["chosen"],
         "tanks_test": numbers["test_V"],
         "tanks_own_start": numbers["test_from_its_first_samples_V"],

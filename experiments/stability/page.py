@@ -78,7 +78,8 @@ def controller_table(found):
     """Both halves side by side."""
     tuned, held = (found[half]["table"] for half in ("tuned", "held_out"))
     kinds = "work", "steps", "median_error", "outside", "alarms"
-    header = ["", "", *(f"{kind.replace('_', ' ')}, {half}" for kind in kinds for half in ("tuned", "held out"))]
+    columns = (f"{kind.replace('_', ' ')}, {half}" for kind in kinds for half in ("tuned", "held out"))
+    header = ["constant", "value", *columns]
 
     def shown(x):
         return f"{x:.2f}" if isinstance(x, float) else x

@@ -42,7 +42,7 @@ def best_table(times):
                 t, method = best(entries, level, (package,))
                 cells.append("-" if t is None else f"{ms(t)} ({method.removeprefix(package).strip()})")
             rows.append([name, level, *cells])
-    return table(["", "error", *present], rows)
+    return table(["scene", "error", *present], rows)
 
 
 def bars(entries):
