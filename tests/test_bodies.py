@@ -229,7 +229,7 @@ def test_a_weld_half_a_turn_off_is_refused():
     """Its rows vanish there, too."""
     free = {"joints": Joint("free"), "mass": 1.0, "inertia": (0.1, 0.1, 0.1)}
     tree([Body("b", rotation=(np.cos(0.5), np.sin(0.5), 0, 0), **free)], loops=[Weld("world", "b")])
-    with pytest.raises(ValueError, match="half a turn off"):
+    with pytest.raises(ValueError, match="error of half a turn"):
         tree([Body("b", rotation=(0.05, 1.0, 0, 0), **free)], loops=[Weld("world", "b")])
 
 
@@ -437,9 +437,9 @@ WRONG = [
     (lambda: Joint("ball", rest=1.0), "`rest` belongs to revolute"),
     (lambda: Joint(damping=-1.0), "`damping` must be 0 or more"),
     (lambda: Body("b", mass=1.0, inertia=(1, 1, 3)), "none larger than the sum"),
-    (lambda: Body("b", inertia=(1, 1, 1)), "has inertia and no mass"),
+    (lambda: Body("b", inertia=(1, 1, 1)), "has inertia but no mass"),
     (lambda: Body("world"), 'must not be "world"'),
-    (lambda: Body("b", joints=[Joint("free"), Joint()]), "a free joint is the only one"),
+    (lambda: Body("b", joints=[Joint("free"), Joint()]), "a free joint must be the only joint"),
     (lambda: Body("b", rotation=np.ones((3, 3))), "(?s)must be a rotation, .* off by 3 and has det R = 0"),
     (lambda: Body("b", rotation=(0, 0, 0, 0)), "a quaternion that is not zero"),
     (lambda: tree([Body("b", joints=Joint(), **BODY), Body("tip", "b", Joint())]), "joint 'tip' .* is singular"),
@@ -503,7 +503,7 @@ def test_params_that_would_be_ignored_are_refused():
     for name in ("position", "ctrl", "frictionloss"):
         with pytest.raises(ValueError, match=f"{name}.* is not read"):
             robot.system.dynamics(zero, zero, zero, 0.0, robot.params | {name: jnp.zeros((3, 3))})
-    with pytest.raises(NotImplementedError, match="say nothing new"):
+    with pytest.raises(NotImplementedError, match="redundant rows"):
         four_bar(free=("position",))
 
 

@@ -422,7 +422,7 @@ def test_another_chunk_in_a_chunks_place_is_noticed(tmp_path):
     assert contents(folder) == before
     other = written(tmp_path / "other", t0=1.0)
     shutil.copy(other / "chunk-00001.npz", folder / "chunk-00001.npz")
-    with pytest.raises(ValueError, match="another sweep's"):
+    with pytest.raises(ValueError, match="another chunk or another sweep"):
         hhtjax.load_sweep(folder)
 
 
