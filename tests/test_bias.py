@@ -172,7 +172,7 @@ def test_two_driven_modes_with_known_masses_have_their_stiffness_corrected():
     chain, dt = driven_pair(entries_of), 0.0227
     fitted = fitted_through_steps(chain, CHAIN, dt)
     correct = dict.fromkeys(CHAIN, True) | {"u": False}
-    with pytest.warns(StepSizeWarning, match="damping .* stays as it is; `refine` corrects it"):
+    with pytest.warns(StepSizeWarning, match="damping .* is not corrected. Use `refine` to correct it"):
         found = hhtjax.step_size_bias(chain, TRAPEZOIDAL, fitted, dt, jnp.zeros(2), correct=correct)
     before, after = (
         {name: abs(float(p[name]) / true - 1) for name, true in CHAIN.items()} for p in (fitted, found.params)

@@ -521,7 +521,7 @@ def test_what_does_not_know_contact_says_so():
         hhtjax.interop.scipy_rhs(system, *start)(0.0, jnp.ones(2))
     with pytest.raises(NotImplementedError, match="has contact, whose forces are not measured"):
         hhtjax.equation_error(system, jnp.ones((99, 1)), 0.01, cutoff=5.0)
-    with pytest.raises(NotImplementedError, match="with contact take hht"):
+    with pytest.raises(NotImplementedError, match="has contact: take hht"):
         hhtjax.analysis.choose_stepper(system, *start, duration=1.0)
 
 

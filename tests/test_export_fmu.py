@@ -175,7 +175,7 @@ def test_a_state_can_be_kept_and_parameters_tuned(slave, expected):
 def test_a_flag_is_an_error_and_so_is_what_is_not_there(slave):
     assert slave.set(k=float("nan")) == OK
     assert slave.begin() == ERROR
-    assert "infinite or none" in slave.messages[-1]
+    assert "infinite or NaN" in slave.messages[-1]
     assert slave.step(0.0, DT)[0] == ERROR
     assert slave.call("Reset") == OK
     assert slave.begin() == OK

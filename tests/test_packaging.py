@@ -65,5 +65,5 @@ def test_the_sdist_holds_what_the_tests_read(built):
 def test_the_range_of_jax_is_told_as_it_is():
     (lowest,) = [x for x in PROJECT["project"]["dependencies"] if x.startswith("jax>=")]
     first, last = lowest.removeprefix("jax>="), ".".join(map(str, compat.NEWEST))
-    assert f"JAX {first} to {last} make kernels" in hhtjax.xla.__doc__
+    assert f"Kernels are made with JAX {first} to {last}." in hhtjax.xla.__doc__
     assert f"JAX from {first} to {last}." in (ROOT / "CONTRIBUTING.md").read_text()

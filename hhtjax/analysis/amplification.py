@@ -71,8 +71,7 @@ def amplification_matrix(
     The system may be nonlinear or constrained. Near an equilibrium, or for a small dt, A shows how perturbations of a
     run grow. Each constraint adds the eigenvalues of infinite frequency, for every dt. Fields that are None are left
     out. So is memory that a step does not change, like the tangent that `operator_splitting` keeps. For a rotation, q
-    is the
-    displacement: R exp(q).
+    is the displacement: R exp(q).
 
     Args:
         system, stepper, params, dt: as in `simulate`.

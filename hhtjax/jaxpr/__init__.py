@@ -26,15 +26,15 @@ Adding a rule for an operation
 An operation (a primitive of JAX) without a rule runs on whole arrays. It ends a kernel if XLA cannot fuse it. So add a
 rule only if `explain` names the operation in a program that matters.
 
-1. Write the rule in `scalar_rules.py`: a function of the operation and of arrays in pieces. It returns the pieces of
-the
-   results, or None to use whole arrays. In the table `UNDERSTOOD` list the parameters and values that it supports.
-2. In `linear_maps.py` add how its results depend on the unknowns.
-3. Add expressions with all options of the operation to `tests/operations_table.py`. `tests/test_conformance.py`
-compares
-   values, forward and reverse derivatives and batches with plain JAX, with NaN, infinities, signed zeros, integers and
-   empty arrays. It fails for a rule without an entry. `python tests/programs.py` compares random programs of all
-   operations. `tests/test_kernels.py` checks what XLA has compiled.
+* Write the rule in `scalar_rules.py`: a function of the operation and of arrays in pieces. It returns the pieces of the
+  results, or None to use whole arrays. In the table `UNDERSTOOD` list the parameters and values that it supports.
+* In `linear_maps.py` add how its results depend on the unknowns.
+* Add expressions with all options of the operation to `tests/operations_table.py`.
+
+`tests/test_conformance.py` compares values, forward and reverse derivatives and batches with plain JAX, with NaN,
+infinities, signed zeros, integers and empty arrays. It fails for a rule without an entry in that table.
+`python tests/programs.py` compares random programs of all operations. `tests/test_kernels.py` checks what XLA has
+compiled.
 """
 
 from hhtjax.jaxpr.dependencies import dependencies as dependencies

@@ -2,10 +2,9 @@
 
 XLA:CPU runs a loop body as a list of kernels. Each kernel costs a call, and each buffer between them costs time too. On
 a small mechanism this takes several times as long as the arithmetic. Also, fused operations are evaluated again for
-each
-user: the sines of a system, for example, once for every column of its Jacobian. Therefore a loop becomes one operation
-here (kernel_primitive.py), which autodiff and vmap keep, and functions get names. When the program is lowered, after
-vmap and autodiff, lowering.py decides which of them become kernels.
+each user: the sines of a system, for example, once for every column of its Jacobian. Therefore a loop becomes one
+operation here (kernel_primitive.py), which autodiff and vmap keep, and functions get names. When the program is
+lowered, after vmap and autodiff, lowering.py decides which of them become kernels.
 """
 
 from __future__ import annotations
