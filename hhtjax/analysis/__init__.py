@@ -13,7 +13,7 @@ grows before it decays, or for ever.
 
 Which stepper a motion needs is answered by `choose_stepper`, which step by `suggest_step_size`; what a run made or lost
 by `energy_balance`; whether the error falls as it should by `observed_order`. `equilibrium` finds where a system is at
-rest.
+rest, `periodic_solution` a forced vibration or a limit cycle with its stability.
 """
 
 from hhtjax.analysis.amplification import (
@@ -42,6 +42,8 @@ from hhtjax.analysis.modal import ModalReduction as ModalReduction
 from hhtjax.analysis.modal import NormalModes as NormalModes
 from hhtjax.analysis.modal import modal_reduction as modal_reduction
 from hhtjax.analysis.modal import modes
+from hhtjax.analysis.periodic import PeriodicSolution as PeriodicSolution
+from hhtjax.analysis.periodic import periodic_solution
 from hhtjax.analysis.statics import Equilibrium as Equilibrium
 from hhtjax.analysis.statics import equilibrium
 from hhtjax.analysis.step_size import Mode as Mode
@@ -60,6 +62,7 @@ __all__ = [
     "observed_order",
     "oscillator_matrix",
     "period_elongation",
+    "periodic_solution",
     "spectral_radius",
     "suggest_step_size",
     "transient_growth",
