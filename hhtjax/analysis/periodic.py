@@ -102,9 +102,9 @@ def periodic_solution(
 
         state(t0 + T) = state(t0),    and with find_period    f0 . (state(t0) - (q0, v0, z0)) = 0
 
-    with state = (q, v, z) after num_steps steps of T/num_steps, and f0 the rate of the state at (q0, v0, z0). The second
-    equation picks a point of the limit cycle. The method of Levenberg and Marquardt solves this with the exact derivative of the run.
-    It finds unstable motions too.
+    with state = (q, v, z) after num_steps steps of T/num_steps, and f0 the rate of the state at (q0, v0, z0). The
+    second equation picks a point of the limit cycle. Levenberg and Marquardt's method solves both with the exact
+    derivative of the run. It finds unstable motions too.
 
     The motion is periodic to rounding for these steps. It differs from that of the system by the error of the stepper:
     with `dop853` or `tsit5` some hundred steps are accurate, with `hht` of order 2 more are needed.
