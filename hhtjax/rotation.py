@@ -9,8 +9,23 @@ R (3, 3) maps material components to spatial ones; Rdot = R hat(Om), with Om the
 
 c1, c2 and c3 are functions of Stumpff (rotation.py), analytic in x, so values and derivatives, forward and reverse, are
 correct at psi = 0 too. Every function keeps the dtype (integers become floats). It raises TypeError unless it receives
-an array of real numbers, and ValueError for a wrong shape. To convert from and to quaternions, use `from_quat` and
-`as_quat` of jax.scipy.spatial.transform.Rotation.
+an array of real numbers, and ValueError for a wrong shape.
+
+Quaternions and Euler angles come from JAX, with the conventions of SciPy: quaternions are (x, y, z, w), and "ZYX" is a
+yaw, then a pitch and a roll about the axes as they are turned. They work under jit, vmap and grad.
+
+>>> from jax.scipy.spatial.transform import Rotation
+>>> R = exp(jnp.array([0.0, 0.0, jnp.pi / 2]))
+>>> print(Rotation.from_matrix(R).as_quat().round(4), Rotation.from_matrix(R).as_euler("ZYX", degrees=True).round(2))
+[0.     0.     0.7071 0.7071] [90.  0.  0.]
+>>> back = Rotation.from_quat(jnp.array([0.0, 0.0, 1.0, 1.0])).as_matrix()                   # scaled to length 1
+>>> bool(jnp.allclose(back, R, atol=1e-6)), bool(jnp.allclose(Rotation.from_euler("Z", jnp.pi / 2).as_matrix(), R))
+(True, True)
+
+For rotation vectors take `exp` and `log`: `from_rotvec`, `as_rotvec` and `magnitude` of JAX have NaN for a derivative at
+the identity. Euler angles have no derivative at gimbal lock, for "ZYX" a pitch of +-90 degrees, and `as_euler` does not
+report it. A quaternion and its negative are one rotation, and along a motion `as_quat` may change from one to the other;
+with `canonical=True` w is not negative.
 
 Reference: Cardona, Geradin, Computers & Structures 33 (1989) 801-820, Sec. 3.
 """

@@ -284,3 +284,38 @@ def test_single_precision_is_refused():
     single = np.ones(1, np.float32)
     with pytest.raises(ValueError, match="SciPy computes in double precision"):
         interop.scipy_rhs(hhtjax.System(np.ones(1), lambda q, v, t, p: -q), single, single)
+
+
+@pytest.mark.filterwarnings("ignore:simulate. in float32")
+def test_a_run_is_a_table(tmp_path):
+    system = hhtjax.System(
+        np.ones(4, np.float32),
+        lambda q, v, t, p: {"R": -v["R"], "x": -q["x"]},
+        constraint=lambda q, t, p: q["x"] - 1,
+    )
+    start = {"R": np.eye(3, dtype=np.float32), "x": np.ones(1, np.float32)}
+    rates = {"R": np.full(3, 0.1, np.float32), "x": np.zeros(1, np.float32)}
+    run = hhtjax.simulate(system, hhtjax.hht(), start, rates, dt=0.1, num_steps=3)
+    table = interop.columns(run)
+    assert [*table][:3] == ["t", "q.R[0,0]", "q.R[0,1]"]
+    assert [*table][10:14] == ["q.x[0]", "v.R[0]", "v.R[1]", "v.R[2]"]
+    assert [*table][-1] == "multipliers[0]"
+    assert len(table) == 1 + 10 + 4 + 4 + 1
+    np.testing.assert_array_equal(table["q.R[1,2]"], run.q["R"][:, 1, 2])
+
+    interop.write_csv(tmp_path / "run.csv", run)
+    read = np.loadtxt(tmp_path / "run.csv", np.float32, delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(read, np.stack([*table.values()], axis=1))  # to the last bit
+
+    batch = jax.tree.map(lambda x: np.stack([x, x[::-1] if np.ndim(x) else x]), run)
+    with pytest.raises(ValueError, match=r"received a batch of \(2,\) runs. Take a member first"):
+        interop.columns(batch)
+    member = interop.columns(jax.tree.map(lambda x: x[1], batch))
+    np.testing.assert_array_equal(member["q.R[1,2]"], table["q.R[1,2]"][::-1])
+    with pytest.raises(TypeError, match="write_csv: `solution` must be a Solution; received 3"):
+        interop.write_csv(tmp_path / "three.csv", 3)
+
+    pandas = pytest.importorskip("pandas")
+    frame, read = pandas.DataFrame(table), pandas.read_csv(tmp_path / "run.csv")
+    assert list(frame) == list(read) == list(table)
+    np.testing.assert_allclose(read, frame, rtol=1e-7)

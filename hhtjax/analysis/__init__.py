@@ -2,7 +2,8 @@
 
 `choose_stepper` recommends a stepper and its tolerances for a motion, `suggest_step_size` a step size. `observed_order`
 measures whether the error falls with the step size as it should. `energy_balance` gives the energy that the numerical
-method has added or removed. `equilibrium` finds where a system is at rest.
+method has added or removed. `equilibrium` finds where a system is at rest. `periodic_solution` finds a forced vibration or a
+limit cycle, with its stability.
 
 The other functions describe one step. A step of size h maps a small motion x to A x. The amplification matrix A is
 computed by automatic differentiation of the real step. Its eigenvalues describe linear vibrations. Their largest
@@ -42,6 +43,8 @@ from hhtjax.analysis.modal import ModalReduction as ModalReduction
 from hhtjax.analysis.modal import NormalModes as NormalModes
 from hhtjax.analysis.modal import modal_reduction as modal_reduction
 from hhtjax.analysis.modal import modes
+from hhtjax.analysis.periodic import PeriodicSolution as PeriodicSolution
+from hhtjax.analysis.periodic import periodic_solution
 from hhtjax.analysis.statics import Equilibrium as Equilibrium
 from hhtjax.analysis.statics import equilibrium
 from hhtjax.analysis.step_size import Mode as Mode
@@ -60,6 +63,7 @@ __all__ = [
     "observed_order",
     "oscillator_matrix",
     "period_elongation",
+    "periodic_solution",
     "spectral_radius",
     "suggest_step_size",
     "transient_growth",

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from hhtjax.analysis.roots import root
 from hhtjax.checks import require_number, require_params
 from hhtjax.description import Array, PyTree, Real, all_concrete
 from hhtjax.description.presentation import shown
@@ -18,7 +19,6 @@ from hhtjax.systems.initial_conditions import initial_values
 from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_system
 from hhtjax.xla import Programs
 
-MOST = 200  # iterations
 BALANCED = 1e-8  # part of the forces that may be left of their sum; in float32 a thousandth
 
 
@@ -114,7 +114,7 @@ def _equilibrium(system: AnySystem, q0: PyTree, v0: PyTree, params: PyTree, t0: 
         Q, pull, Phi = parts(y)
         return jnp.concatenate([Q + pull, Phi])
 
-    y = lax.custom_root(unbalanced, jnp.zeros(N + m, v.dtype), _nearest_root, _tangent)
+    y = root(unbalanced, jnp.zeros(N + m, v.dtype))
     (Q, pull, Phi), at = parts(y), place(y)
     begun = parts(jnp.zeros_like(y))
     size = jnp.maximum(jnp.max(jnp.abs(jnp.concatenate([Q, pull, begun[0]]))), jnp.finfo(v.dtype).tiny)
@@ -126,37 +126,3 @@ def _equilibrium(system: AnySystem, q0: PyTree, v0: PyTree, params: PyTree, t0: 
     z = flat.unravel_internal(at[1][n:]) if 0 < n < N else None
     q = flat.unravel(at[0]) if n else flat.unravel(at[1])
     return Equilibrium(q, at[2] if m else None, z, left, left <= enough)
-
-
-def _nearest_root(f, y: Array) -> Array:
-    """A y with f(y) = 0, by Levenberg and Marquardt: steps of (J^T J + lam D^2) dy = -J^T f, D of the columns of J."""
-
-    def look(y: Array):
-        r = f(y)
-        return r, jnp.sum(r**2)
-
-    def unfinished(carry: tuple) -> Array:
-        *_, moved, k = carry
-        return moved & (k < MOST)
-
-    def improve(carry: tuple):
-        y, r, cost, lam, _, k = carry
-        J = jax.jacfwd(f)(y)
-        D = jnp.sqrt(jnp.sum(J**2, axis=0))
-        D = jnp.where(D == 0, 1, D)
-        A = jnp.concatenate([J / D[None, :], jnp.sqrt(lam) * jnp.eye(y.size, dtype=y.dtype)])
-        dy = jnp.linalg.lstsq(A, jnp.concatenate([-r, jnp.zeros_like(y)]))[0] / D
-        new, there = look(y + dy)
-        better = there < cost  # NaN is not
-        little = jnp.max(jnp.abs(dy) * D) <= 4 * float(jnp.finfo(y.dtype).eps) * jnp.max(jnp.abs(y) * D)
-        y, r, cost = (jnp.where(better, a, b) for a, b in ((y + dy, y), (new, r), (there, cost)))
-        lam = jnp.clip(jnp.where(better, lam / 10, lam * 10), 1e-16, 1e8)
-        return y, r, cost, lam, (cost > 0) & ~little & (better | (lam < 1e8)), k + 1
-
-    begin = (y, *look(y), jnp.asarray(1e-3, y.dtype), jnp.asarray(True), jnp.zeros((), jnp.int32))
-    return lax.while_loop(unfinished, improve, begin)[0]
-
-
-def _tangent(g, b: Array) -> Array:
-    """x with g(x) = b, g being linear."""
-    return jnp.linalg.solve(jax.jacfwd(g)(jnp.zeros_like(b)), b)

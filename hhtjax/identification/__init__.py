@@ -109,6 +109,7 @@ from hhtjax.identification.bias import step_size_bias
 from hhtjax.identification.comparison import Comparison as Comparison
 from hhtjax.identification.comparison import NestedTest as NestedTest
 from hhtjax.identification.comparison import compare
+from hhtjax.identification.free_coordinates import Unconstrained, unconstrained
 from hhtjax.identification.identifiability import IdentifiabilityWarning
 from hhtjax.identification.identify import Multistart as Multistart
 from hhtjax.identification.identify import fit, multistart
@@ -142,6 +143,7 @@ __all__ = [
     "Refined",
     "StepSizeWarning",
     "Uncertainty",
+    "Unconstrained",
     "Windows",
     "accelerometer",
     "base_parameters",
@@ -161,6 +163,7 @@ __all__ = [
     "refine",
     "score_test",
     "step_size_bias",
+    "unconstrained",
     "windows",
     "wrap_angle",
 ]

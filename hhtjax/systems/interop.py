@@ -1,4 +1,4 @@
-"""Systems as other packages take them: a diffrax term, a right-hand side for SciPy's `solve_ivp`; `hhtjax.interop`.
+"""What other packages take: systems as diffrax terms or for SciPy's `solve_ivp`, runs as tables; `hhtjax.interop`.
 
 The second-order system becomes the first-order one of y = (q, v),
 
@@ -10,10 +10,12 @@ and stays orthogonal to the accuracy of the solver. With internal states, y = (q
 
 from __future__ import annotations
 
+import csv
 import importlib
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from os import PathLike
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,17 +23,29 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_number, require_params
-from hhtjax.description import Array, Description, PyTree, Real, as_float, current, thaw
+from hhtjax.description import Array, Description, PyTree, Real, all_concrete, as_float, current, thaw
 from hhtjax.description.presentation import shown
 from hhtjax.systems.constraints import acceleration_and_multipliers
 from hhtjax.systems.flat_system import flatten
 from hhtjax.systems.initial_conditions import initial_values, require_consistent
 from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_smooth, require_system
 
-if TYPE_CHECKING:
-    pass
+COLUMNS = (
+    "t",
+    "q",
+    "v",
+    "acceleration",
+    "multipliers",
+    "z",
+    "zdot",
+    "friction",
+    "sticking",
+    "contact",
+    "error",
+    "output",
+)
 
-__all__ = ["FlatODE", "ScipyRHS", "diffrax_term", "flat_ode", "ode", "scipy_rhs"]
+__all__ = ["FlatODE", "ScipyRHS", "columns", "diffrax_term", "flat_ode", "ode", "scipy_rhs", "write_csv"]
 
 
 def ode(system: AnySystem):
@@ -209,6 +223,86 @@ def scipy_rhs(
         return flat.unravel(jnp.asarray(y)) if np.ndim(y) == 1 else jax.vmap(flat.unravel)(jnp.asarray(y).T)
 
     return ScipyRHS(partial(call, 0), np.asarray(flat.y0), unravel, partial(call, 1))
+
+
+def columns(solution: Any) -> dict[str, np.ndarray]:
+    """A run as the columns of a table, one row for each saved time: `pandas.DataFrame(columns(solution))`.
+
+    A name is that of the attribute of the `Solution`, then keys of the pytree, then indices of the array: "t", "q[0]",
+    "q.angle", "q.R[0,2]", "acceleration[1]", "multipliers[0]", "contact.normal[0]", "output.pull". What the run does
+    not have has no column.
+
+    Args:
+        solution: the `Solution` of one run. Of a batch take a member: `jax.tree.map(lambda x: x[i], solution)`.
+
+    Returns:
+        Arrays (K + 1,) of NumPy, with their dtype.
+
+    Raises:
+        TypeError: what is no `Solution`, or holds tracers.
+        ValueError: a batch of runs.
+
+    >>> import jax.numpy as jnp, hhtjax
+    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: {"x": -q["x"]})
+    >>> run = hhtjax.simulate(spring, hhtjax.hht(), {"x": jnp.ones(1)}, {"x": jnp.zeros(1)}, dt=0.5, num_steps=4)
+    >>> table = hhtjax.interop.columns(run)
+    >>> list(table), table["t"].tolist()
+    (['t', 'q.x[0]', 'v.x[0]', 'acceleration.x[0]'], [0.0, 0.5, 1.0, 1.5, 2.0])
+    """
+    return _columns("columns", solution)
+
+
+def write_csv(path: str | PathLike, solution: Any):
+    """A run as a file of comma-separated values: the names of `columns` in the first line, then a line for each time.
+
+    Numbers have the digits that it takes to read the same number back, of float64 up to 17 and of float32 up to 9.
+
+    Args:
+        path: of the file, which is replaced if it exists.
+        solution: as in `columns`.
+
+    Raises:
+        TypeError, ValueError: as `columns`.
+        OSError: a file that cannot be written.
+
+    >>> import tempfile, jax.numpy as jnp, hhtjax
+    >>> from pathlib import Path
+    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -q)
+    >>> run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.5, num_steps=4)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     hhtjax.interop.write_csv(f"{folder}/run.csv", run)
+    ...     print(*Path(folder, "run.csv").read_text().splitlines()[:2])
+    t,q[0],v[0],acceleration[0] 0.0,1.0,0.0,-1.0
+    """
+    table = _columns("write_csv", solution)
+    with open(path, "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(table)
+        writer.writerows(zip(*(x.astype(str) for x in table.values()), strict=True))
+
+
+def _columns(caller: str, solution: Any) -> dict[str, np.ndarray]:
+    """The columns by name, or an error of the caller."""
+    fields = getattr(solution, "_fields", ())
+    if not {"t", "q", "output"} <= set(fields):
+        raise TypeError(f"{caller}: `solution` must be a Solution; received {solution!r}.")
+    given = {name: getattr(solution, name) for name in COLUMNS}
+    if not all_concrete(given):
+        raise TypeError(f"{caller}: `solution` must be known: call it outside jit, vmap and grad.")
+    if np.ndim(solution.t) != 1:
+        raise ValueError(
+            f"{caller}: `solution` must be one run; received a batch of {np.shape(solution.t)[:-1]} runs. Take a "
+            "member first: jax.tree.map(lambda x: x[i], solution)."
+        )
+    table = {}
+    for name in COLUMNS:
+        for path, x in jax.tree_util.tree_leaves_with_path(given[name]):
+            where = jax.tree_util.keystr(path, simple=True, separator=".")
+            x, title = np.asarray(x), f"{name}.{where}" if where else name
+            for index in np.ndindex(x.shape[1:]):
+                suffix = f"[{','.join(map(str, index))}]" if index else ""
+                table[title + suffix] = x[:, *index]
+    return table
 
 
 def _ode(system, t, y, params: PyTree):
