@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_integer
 from hhtjax.description import Array, Description, PyTree, Real, is_concrete
-from hhtjax.description.presentation import shown
+from hhtjax.description.presentation import Table, frequency_cells, known, shown
 from hhtjax.numerics.sparse_matrix import Sparse
 from hhtjax.numerics.superlu import is_positive_definite
 from hhtjax.systems.linear_system import LinearSystem
@@ -27,24 +27,29 @@ SHIFTS = 0.0, 1e-12, 1e-9, 1e-6  # relative to the largest K_ii/M_ii: the first 
 
 @shown
 class NormalModes(NamedTuple):
-    """What `modes` returns, of free vibration about rest.
+    """What `modes` returns, of free vibration about rest; as text, a table of frequencies in rad/s and Hz, and periods.
 
     Attributes:
-        frequencies: (count,), rad per unit of time, lowest first, 0 for rigid motions.
+        frequencies: (count,), rad/s, where times are in s; lowest first, 0 for rigid motions.
         shapes: T, (n, count), a mode in each column, with T^T M T = 1 and the largest entry of a column positive.
     """
 
     frequencies: np.ndarray
     shapes: np.ndarray
 
+    def _table(self):
+        """Mode by mode."""
+        n, count = np.shape(self.shapes)
+        return _frequency_table(f"NormalModes: {count} of a system of {n} coordinates", self.frequencies)
+
 
 @shown
 class ModalReduction(NamedTuple):
-    """What `modal_reduction` returns: the reduced system, and the way to it and back.
+    """What `modal_reduction` returns: the reduced system, and the way to it and back; as text, a table as `modes`.
 
     Attributes:
         system: the `LinearSystem` of the modal coordinates x, (count,).
-        frequencies: (count,), rad per unit of time, lowest first.
+        frequencies: (count,), rad/s, where times are in s; lowest first.
         shapes: T, (n, count), q = T x.
         inverse: T^T M, (count, n), x = T^T M q.
     """
@@ -54,6 +59,11 @@ class ModalReduction(NamedTuple):
     shapes: Any
     inverse: Array
 
+    def _table(self):
+        """Mode by mode."""
+        n, count = np.shape(self.shapes)
+        return _frequency_table(f"ModalReduction: {n} coordinates in {count} modes", self.frequencies)
+
     def expand(self, q: Array) -> Array:
         """Coordinates (..., n) of modal ones (..., count), T q: positions, velocities, accelerations."""
         return jnp.asarray(q) @ jnp.asarray(self.shapes).T
@@ -61,6 +71,13 @@ class ModalReduction(NamedTuple):
     def project(self, q: np.ndarray) -> Array:
         """Modal coordinates (..., count) of given ones (..., n), T^T M q: of what the modes span, exactly."""
         return jnp.asarray(q) @ jnp.asarray(self.inverse).T
+
+
+def _frequency_table(title: str, frequencies: Any) -> Table:
+    """Frequencies in rad/s and Hz, and periods; only a title where they are tracers."""
+    w = known(frequencies)
+    numbered = enumerate([] if w is None else w.tolist(), 1)
+    return Table(title, [["mode", "rad/s", "Hz", "period"], *([str(i), *frequency_cells(x)] for i, x in numbered)])
 
 
 def modes(M: Real, K: Real, count: int | None = None) -> NormalModes:
@@ -84,6 +101,11 @@ def modes(M: Real, K: Real, count: int | None = None) -> NormalModes:
     >>> import numpy as np, hhtjax
     >>> K = 100.0 * (2 * np.eye(3) - np.eye(3, k=1) - np.eye(3, k=-1))          # three masses between two walls
     >>> found = hhtjax.analysis.modes(np.ones(3), K, count=2)
+    >>> found
+    NormalModes: 2 of a system of 3 coordinates
+        mode  rad/s  Hz    period
+        1     7.654  1.22  0.821 s
+        2     14.14  2.25  0.444 s
     >>> [round(float(w), 6) for w in found.frequencies], [round(20 * float(np.sin(j * np.pi / 8)), 6) for j in (1, 2)]
     ([7.653669, 14.142136], [7.653669, 14.142136])
     """

@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.analysis.amplification import damping_ratio, eigenvalues, period_elongation
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real, freeze
+from hhtjax.description.presentation import frequency_cells
 from hhtjax.steppers.stepper import Stepper, begun, require_capable, require_stepper
 from hhtjax.systems.constraints import acceleration_and_multipliers, jacobian
 from hhtjax.systems.flat_system import flatten
@@ -31,7 +32,7 @@ class Mode(NamedTuple):
     """A mode of the linearised system, and what the stepper makes of it at the suggested step.
 
     Attributes:
-        frequency: |lambda|, natural frequency in rad/s, or rate of a motion that does not oscillate.
+        frequency: |lambda|, natural frequency in rad/s, or rate of a motion that does not oscillate, in 1/s.
         damping_ratio: -1 for pure growth, 1 for pure decay.
         largest_dt: up to which the stepper keeps to the tolerance.
         numerical_damping_ratio, period_elongation: of the discrete mode; NaN where one of the two does not oscillate.
@@ -49,6 +50,10 @@ class Mode(NamedTuple):
 class StepSize(NamedTuple):
     """A suggestion; as text, a table.
 
+    Its columns: the natural frequency of a mode in rad/s and Hz; its period, 2 pi/frequency, and the change of
+    the period in steps of dt; its damping ratio, and that in steps of dt; the largest step that resolves it; frequency
+    times dt; whether dt resolves it.
+
     Attributes:
         dt: s.
         reason: what limits it.
@@ -60,18 +65,19 @@ class StepSize(NamedTuple):
     modes: tuple[Mode, ...]
 
     def __str__(self) -> str:
-        rows = [["rad/s", "damping ratio", "largest dt", "w h", "its damping ratio", "its period", ""]]
+        rows = [["rad/s", "Hz", "period", "in steps", "damping", "in steps", "largest dt", "w h", "resolved"]]
         for mode in self.modes:
+            w = frequency_cells(mode.frequency)
             swings = mode.period_elongation == mode.period_elongation  # no NaN
             rows.append(
                 [
-                    f"{mode.frequency:.4g}",
+                    *(w if abs(mode.damping_ratio) < 1 else [w[0], "-", "-"]),
+                    f"{100 * mode.period_elongation:+.3g} %" if swings else "-",
                     f"{mode.damping_ratio:.3g}",
+                    f"{mode.numerical_damping_ratio:.3g}" if swings else "-",
                     f"{mode.largest_dt:.3g} s",
                     f"{mode.frequency * self.dt:.3g}",
-                    f"{mode.numerical_damping_ratio:.3g}" if swings else "-",
-                    f"{100 * mode.period_elongation:+.3g} %" if swings else "-",
-                    "resolved" if mode.resolved else "not resolved",
+                    "yes" if mode.resolved else "no",
                 ]
             )
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -137,9 +143,9 @@ def suggest_step_size(
     >>> found = suggest_step_size(system, hhtjax.hht(alpha=-0.05), jnp.zeros(2), jnp.zeros(2), highest=10.0)
     >>> print(found)
     dt = 0.316 s: resolves the mode at 1 rad/s to 0.01
-    rad/s  damping ratio  largest dt    w h  its damping ratio  its period
-        1           0.05     0.316 s  0.316             0.0492    +0.934 %      resolved
-      100              0   0.00316 s   31.6             0.0329      +949 %  not resolved
+    rad/s     Hz    period  in steps  damping  in steps  largest dt    w h  resolved
+        1  0.159    6.28 s  +0.934 %     0.05    0.0492     0.316 s  0.316       yes
+      100   15.9  0.0628 s    +949 %        0    0.0329   0.00316 s   31.6        no
     """
     caller = "suggest_step_size"
     require_stepper(caller, stepper)
