@@ -158,7 +158,7 @@ PICTURES = {
         scenes.shaken_table.shaken_table,
         "A body rides on a table that shakes, is thrown off, flies, and lands.",
         (0.3,),
-        {"height of the body (m)": 0},
+        {"height (m)": 0},
         film=(20, 0.4),
     ),
     "impact_oscillator": Picture(
@@ -238,12 +238,12 @@ def film(picture: Picture, scene, run, path):
 def run(report, fast):
     """All pictures; those of FAST in a smoke run."""
     chosen = {name: x for name, x in PICTURES.items() if name in FAST or not fast}
-    made = {name: picture.scene() for name, picture in chosen.items()}
-    with ThreadPoolExecutor() as pool:
-        runs = dict(zip(made, pool.map(lambda scene: of(scene, 500 if fast else STEPS), made.values()), strict=True))
-    for name, picture in chosen.items():
-        report.figure(f"scenes_{name}", draw(picture, made[name], runs[name]))
-        if picture.film and not fast:
-            path = report.out / f"scenes_{name}.gif"
-            film(picture, made[name], runs[name], path)
-            report.written.append(path)
+    made = [picture.scene() for picture in chosen.values()]
+    with ThreadPoolExecutor(2) as pool:  # the next ones compile while one is drawn
+        runs = pool.map(lambda scene: of(scene, 500 if fast else STEPS), made)
+        for (name, picture), scene, found in zip(chosen.items(), made, runs, strict=True):
+            report.figure(f"scenes_{name}", draw(picture, scene, found))
+            if picture.film and not fast:
+                path = report.out / f"scenes_{name}.gif"
+                film(picture, scene, found, path)
+                report.written.append(path)
