@@ -35,6 +35,7 @@ EXPERIMENTS = {
     "kim2019": "kim2019.kim2019",
     "cardona_geradin1989": "cardona_geradin1989.cardona_geradin1989",
     "reported": "reported.reported",
+    "scenes": "scenes.scenes",
     "linearization": "linearization.linearization",
     "stability": "stability.stability",
     "flexible": "flexible.flexible",

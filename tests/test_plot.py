@@ -233,7 +233,7 @@ def test_animation_moves_in_the_plane_and_in_space(swing, tmp_path):
     assert ax.get_xlabel() == "x (m)"
     bars = plot.configuration(swing, lambda q: [np.array([[0.0, 0.0, 0.0], [q[0], 0.0, q[1]]])], [0.0, 0.4])
     assert bars.get_zlabel() == "z (m)"
-    assert labels(bars) == ["t = 0", "t = 0.4"]
+    assert labels(bars) == ["t = 0 s", "t = 0.4 s"]
 
 
 @pytest.mark.slow

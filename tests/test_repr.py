@@ -119,7 +119,7 @@ def test_a_batch_and_a_sweep_say_how_many():
         (Interpolant(jnp.ones((2, 1)), None), "Interpolant(q=float64[2,1])"),
         (
             ModeBias(*jnp.array([[10.0, 20], [0, 0.1], [0.1, 0.2], [0.01, 0.02], [0, 0.03]])),
-            "ModeBias(2 modes, 10 ... 20 rad/s, w h = 0.1 ... 0.2: stiffness off by 1 ... 2 %, damping by 0 ... 3 %,",
+            "ModeBias(2 modes, 10 ... 20 rad/s (1.59 ... 3.18 Hz), w h = 0.1 ... 0.2: stiffness off by 1 ... 2 %, ",
         ),
     ],
 )

@@ -49,6 +49,10 @@ def test_suggested_step_is_the_largest_that_resolves_the_modes():
         lines = str(found).splitlines()
         assert f"{abs(rate):.4g} rad/s" in lines[0]
         assert len(lines) == 4
+        assert max(map(len, lines)) <= 95
+        hertz, period = lines[2].split()[1:3]
+        assert float(hertz) == pytest.approx(found.modes[0].frequency / (2 * np.pi), rel=5e-3)
+        assert float(period) == pytest.approx(2 * np.pi / found.modes[0].frequency, rel=5e-3)
 
 
 def test_suggested_step_of_an_explicit_method_is_a_stable_one():

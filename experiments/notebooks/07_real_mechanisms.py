@@ -195,6 +195,9 @@ figure, axes = hhtjax.plot.subplots(width=100, height=75)
 for i, end in enumerate((0.6, 1.2, 2.0)):
     cycle = (loops.t > end - 1 / rubber["frequency"]) & (loops.t <= end)
     axes.plot(1e3 * loops.q[cycle, 0], loops.z[cycle, 0], ls=hhtjax.plot.LINES[i], label=f"cycle that ends at {end} s")
+axes.fill(1e3 * loops.q[cycle, 0], loops.z[cycle, 0], color=hhtjax.plot.COLOURS[2], alpha=0.1, lw=0)  # what is lost
+for text, at, towards in (("out", (-0.9, 40), (-0.1, 85)), ("back", (0.9, -50), (0.1, -95))):
+    axes.annotate(text, towards, at, ha="center", va="center", arrowprops={"arrowstyle": "->"})
 axes.set(xlabel="displacement (mm)", ylabel="hysteretic force z (N)")
 axes.legend()
 plt.show()
@@ -204,8 +207,17 @@ damped = float(jnp.sum(rubber["c"] * loops.v[last] ** 2) * 2e-4)
 print(f"the hysteresis takes {1e3 * eaten:.0f} mJ out of the last cycle, the damper {1e3 * damped:.1f} mJ")
 
 # %% [markdown]
-# **Look at** the area inside a loop: the energy that a cycle loses. Small motions hardly open a loop; large ones lose
-# much. `hhtjax.scenes` has more that remembers: friction with bristles that bend before they slip (`lugre`), a rubber
+# **Look at** the loop of the last cycle. It is run through clockwise: at one displacement the mount pushes back more
+# on the way to the right ("out", the upper branch) than on the way to the left ("back", the lower branch). So a cycle
+# takes more work than it gives back, and the area inside the loop is the energy that it loses. Small motions hardly
+# open a loop; large ones lose much.
+#
+# The tips are sharp because $\dot z$ changes at once when the velocity changes its sign: with these $\gamma$ and
+# $\delta$ the force falls much faster behind a turn than it rose before it. Each turn also makes the mass vibrate a
+# little, at a frequency far above that of the load. Where that turns the velocity once more, a notch appears beside the
+# tip: a small loop of its own. The loops do not close, as the load grows from cycle to cycle.
+#
+# `hhtjax.scenes` has more that remembers: friction with bristles that bend before they slip (`lugre`), a rubber
 # mount of Maxwell branches (`maxwell`), a motor with its controller (`motor_joint`).
 #
 # ## A bouncing ball: a stiff contact

@@ -1,10 +1,15 @@
-"""The charts: error against time, against factorised matrices, and the gradient's error against time."""
+"""The charts: error against time, against factorised matrices, and the gradient's error against time.
 
+`python -m experiments.work_precision.figures` draws them again from the committed numbers.
+"""
+
+import json
 import textwrap
+from pathlib import Path
 
 import numpy as np
 
-from experiments.report import COLOURS, MARKERS
+from experiments.report import COLOURS, MARKERS, Report
 from hhtjax.plot import subplots, work_precision
 
 WORST = 10  # error beyond which a run is not drawn
@@ -49,7 +54,22 @@ GRADIENTS = {
     "CasADi": ("CasADi CVODES, forward",),
 }
 
-OURS = tuple(COLOURS[i] for i in (0, 0, 5, 5, 5, 7, 7, 7, 6, 6, 6))  # hht, others; the same with error control
+# colour and marker of each method of ours: Okabe and Ito's colours, with error control Tol's muted ones
+OURS = {
+    "hht": ("#0072B2", "o"),
+    "hht, predictor": ("#0072B2", "o"),
+    "hht, extrapolate=2": ("#56B4E9", "s"),
+    "rowda": ("#009E73", "^"),
+    "rodas5p": ("#D55E00", "D"),
+    "tsit5": ("#E69F00", "v"),
+    "rk4": ("#E69F00", "v"),
+    "hht, adaptive": ("#332288", "P"),
+    "extrapolated, adaptive": ("#CC79A7", "X"),
+    "rodas5p, adaptive": ("#882255", "*"),
+    "tsit5, adaptive": ("#999933", "o"),
+    "dop853, adaptive": ("#44AA99", "s"),
+    "taylor, adaptive": ("#000000", "^"),
+}
 THEIRS = {
     **dict(zip(PACKAGES[1:5], COLOURS[1:5], strict=True)),
     **{"heyoka": "#e7298a", "numbalsoda": "#8c2d04", "CasADi": "#6a51a3", "sksundae": "#b279d6"},
@@ -62,12 +82,13 @@ def kind(method):
     return method.removesuffix(", forward").removesuffix(", reverse")
 
 
-def style(package, number, is_reverse):
-    """Colour by package, of ours by kind; marker by method, hollow for a gradient in reverse mode."""
+def style(package, method, number):
+    """Colour and marker by method, of others by package and its number there; hollow for a gradient in reverse mode."""
     line = {"ls": "-", "lw": 1.4} if package == "ours" else {"ls": "--", "lw": 0.9}
-    colour = OURS[number % len(OURS)] if package == "ours" else THEIRS[package]
-    hollow = {"mfc": "white"} if is_reverse else {}
-    return line | {"color": colour, "marker": MARKERS[number % len(MARKERS)], "ms": 3.5} | hollow
+    theirs = THEIRS.get(package), MARKERS[(PACKAGES.index(package) + 3 * number) % len(MARKERS)]
+    colour, marker = OURS[kind(method)] if package == "ours" else theirs
+    hollow = {"mfc": "white"} if method.endswith(", reverse") else {}
+    return line | {"color": colour, "marker": marker, "ms": 4} | hollow
 
 
 def curves(lines, case, x, shown):
@@ -83,7 +104,7 @@ def curves(lines, case, x, shown):
             pairs = [pair for line in mine for pair in zip(line[x], line["rms_error"], strict=True)]
             points = [(scale * a, e) for a, e in pairs if a and e and e < WORST]
             if points:
-                look = style(package, kinds.index(kind(method)), method.endswith(", reverse"))
+                look = style(package, method, kinds.index(kind(method)))
                 found[package][method] = (*np.array(points).T, look)
     return found
 
@@ -124,7 +145,7 @@ def panels(lines, names, x, xlabel, ylabel, shown):
     for panel in grid[-1]:
         panel.set_xlabel(xlabel)
     key = keys[0] | keys[1]
-    drawn.legend(key.values(), key.keys(), loc="outside upper center", ncols=4 if max(map(len, key)) < 26 else 3)
+    drawn.legend(key.values(), key.keys(), loc="outside upper center", ncols=4 if max(map(len, key)) < 22 else 3)
     return drawn
 
 
@@ -153,3 +174,14 @@ def draw_gradients(report, lines, names):
     for name, some in gradient_figures(names).items():
         label = "time of value and gradient (ms)"
         report.figure(name, panels(lines, some, "time_s", label, "relative error", GRADIENTS))
+
+
+def redraw(here: Path):
+    """The figures of the numbers in a folder, into it."""
+    numbers, report = json.loads((here / "work_precision.json").read_text()), Report("work_precision", here)
+    draw(report, numbers["lines"], list(numbers["times"]))
+    draw_gradients(report, numbers["gradient_lines"], list(numbers["gradient_times"]))
+
+
+if __name__ == "__main__":
+    redraw(Path(__file__).parent)

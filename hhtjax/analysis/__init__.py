@@ -2,8 +2,8 @@
 
 `choose_stepper` recommends a stepper and its tolerances for a motion, `suggest_step_size` a step size. `observed_order`
 measures whether the error falls with the step size as it should. `energy_balance` gives the energy that the numerical
-method has added or removed. `equilibrium` finds where a system is at rest. `periodic_solution` finds a forced vibration or a
-limit cycle, with its stability.
+method has added or removed. `equilibrium` finds where a system is at rest. `periodic_solution` finds a forced vibration
+or a limit cycle, with its stability.
 
 The other functions describe one step. A step of size h maps a small motion x to A x. The amplification matrix A is
 computed by automatic differentiation of the real step. Its eigenvalues describe linear vibrations. Their largest

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from hhtjax.checks import require_integer
 from hhtjax.description import Array, Description, PyTree, Real, is_concrete
-from hhtjax.description.presentation import shown
+from hhtjax.description.presentation import Table, frequency_cells, known, shown
 from hhtjax.numerics.sparse_matrix import Sparse
 from hhtjax.numerics.superlu import is_positive_definite
 from hhtjax.systems.linear_system import LinearSystem
@@ -27,24 +27,31 @@ SHIFTS = 0.0, 1e-12, 1e-9, 1e-6  # relative to the largest K_ii/M_ii: the first 
 
 @shown
 class NormalModes(NamedTuple):
-    """Result of `modes`: natural frequencies and mode shapes of free vibration about rest.
+    """Result of `modes`: natural frequencies and mode shapes of free vibration about rest. Prints as a table.
 
     Attributes:
-        frequencies: (count,), rad per unit of time, lowest first, 0 for rigid motions.
+        frequencies: (count,), rad/s where times are in s, lowest first, 0 for rigid motions.
         shapes: T, (n, count), with a mode in each column. T^T M T = 1, and the largest entry of a column is positive.
     """
 
     frequencies: np.ndarray
     shapes: np.ndarray
 
+    def _table(self):
+        """Mode by mode."""
+        n, count = np.shape(self.shapes)
+        return _frequency_table(f"NormalModes: {count} of a system of {n} coordinates", self.frequencies)
+
 
 @shown
 class ModalReduction(NamedTuple):
     """Result of `modal_reduction`: the reduced system, and the maps from and to the full coordinates.
 
+    Prints as a table, as `modes`.
+
     Attributes:
         system: the `LinearSystem` of the modal coordinates x, (count,).
-        frequencies: (count,), rad per unit of time, lowest first.
+        frequencies: (count,), rad/s, where times are in s; lowest first.
         shapes: T, (n, count), q = T x.
         inverse: T^T M, (count, n), x = T^T M q.
     """
@@ -54,6 +61,11 @@ class ModalReduction(NamedTuple):
     shapes: Any
     inverse: Array
 
+    def _table(self):
+        """Mode by mode."""
+        n, count = np.shape(self.shapes)
+        return _frequency_table(f"ModalReduction: {n} coordinates in {count} modes", self.frequencies)
+
     def expand(self, q: Array) -> Array:
         """Full coordinates (..., n) from modal ones (..., count): T q, for positions, velocities or accelerations."""
         return jnp.asarray(q) @ jnp.asarray(self.shapes).T
@@ -61,6 +73,13 @@ class ModalReduction(NamedTuple):
     def project(self, q: np.ndarray) -> Array:
         """Modal coordinates (..., count) from full ones (..., n): T^T M q; exact for motions that the modes span."""
         return jnp.asarray(q) @ jnp.asarray(self.inverse).T
+
+
+def _frequency_table(title: str, frequencies: Any) -> Table:
+    """Frequencies in rad/s and Hz, and periods; only a title where they are tracers."""
+    w = known(frequencies)
+    numbered = enumerate([] if w is None else w.tolist(), 1)
+    return Table(title, [["mode", "rad/s", "Hz", "period"], *([str(i), *frequency_cells(x)] for i, x in numbered)])
 
 
 def modes(M: Real, K: Real, count: int | None = None) -> NormalModes:
@@ -85,6 +104,11 @@ def modes(M: Real, K: Real, count: int | None = None) -> NormalModes:
     >>> import numpy as np, hhtjax
     >>> K = 100.0 * (2 * np.eye(3) - np.eye(3, k=1) - np.eye(3, k=-1))          # three masses between two walls
     >>> found = hhtjax.analysis.modes(np.ones(3), K, count=2)
+    >>> found
+    NormalModes: 2 of a system of 3 coordinates
+        mode  rad/s  Hz    period
+        1     7.654  1.22  0.821 s
+        2     14.14  2.25  0.444 s
     >>> [round(float(w), 6) for w in found.frequencies], [round(20 * float(np.sin(j * np.pi / 8)), 6) for j in (1, 2)]
     ([7.653669, 14.142136], [7.653669, 14.142136])
     """

@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 from hhtjax.analysis.amplification import damping_ratio, eigenvalues, period_elongation
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real, freeze
+from hhtjax.description.presentation import frequency_cells
 from hhtjax.runs.progress import stages
 from hhtjax.steppers.stepper import Stepper, begun, require_capable, require_stepper
 from hhtjax.systems.constraints import acceleration_and_multipliers, jacobian
@@ -33,7 +34,7 @@ class Mode(NamedTuple):
     """A mode of the linearised system, and its numerical solution with the suggested step.
 
     Attributes:
-        frequency: |lambda|, natural frequency in rad/s, or rate of a motion that does not oscillate.
+        frequency: |lambda|, natural frequency in rad/s, or rate of a motion that does not oscillate, in 1/s.
         damping_ratio: damping ratio of the mode; -1 for pure growth, 1 for pure decay.
         largest_dt: largest step with which the stepper keeps the error of the mode within the tolerance, s.
         numerical_damping_ratio: damping ratio of the mode in the steps.
@@ -53,6 +54,10 @@ class Mode(NamedTuple):
 class StepSize(NamedTuple):
     """Result of `suggest_step_size`; prints as a table of the modes.
 
+    Its columns: the natural frequency of a mode in rad/s and Hz; its period, 2 pi/frequency, and the change of
+    the period in steps of dt; its damping ratio, and that in steps of dt; the largest step that resolves it; frequency
+    times dt; whether dt resolves it.
+
     Attributes:
         dt: suggested step size, s.
         reason: what limits it, in words.
@@ -64,18 +69,19 @@ class StepSize(NamedTuple):
     modes: tuple[Mode, ...]
 
     def __str__(self) -> str:
-        rows = [["rad/s", "damping ratio", "largest dt", "w h", "its damping ratio", "its period", ""]]
+        rows = [["rad/s", "Hz", "period", "in steps", "damping", "in steps", "largest dt", "w h", "resolved"]]
         for mode in self.modes:
+            w = frequency_cells(mode.frequency)
             swings = mode.period_elongation == mode.period_elongation  # no NaN
             rows.append(
                 [
-                    f"{mode.frequency:.4g}",
+                    *(w if abs(mode.damping_ratio) < 1 else [w[0], "-", "-"]),
+                    f"{100 * mode.period_elongation:+.3g} %" if swings else "-",
                     f"{mode.damping_ratio:.3g}",
+                    f"{mode.numerical_damping_ratio:.3g}" if swings else "-",
                     f"{mode.largest_dt:.3g} s",
                     f"{mode.frequency * self.dt:.3g}",
-                    f"{mode.numerical_damping_ratio:.3g}" if swings else "-",
-                    f"{100 * mode.period_elongation:+.3g} %" if swings else "-",
-                    "resolved" if mode.resolved else "not resolved",
+                    "yes" if mode.resolved else "no",
                 ]
             )
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -145,9 +151,9 @@ def suggest_step_size(
     >>> found = suggest_step_size(system, hhtjax.hht(alpha=-0.05), jnp.zeros(2), jnp.zeros(2), highest=10.0)
     >>> print(found)
     dt = 0.316 s: resolves the mode at 1 rad/s to 0.01
-    rad/s  damping ratio  largest dt    w h  its damping ratio  its period
-        1           0.05     0.316 s  0.316             0.0492    +0.934 %      resolved
-      100              0   0.00316 s   31.6             0.0329      +949 %  not resolved
+    rad/s     Hz    period  in steps  damping  in steps  largest dt    w h  resolved
+        1  0.159    6.28 s  +0.934 %     0.05    0.0492     0.316 s  0.316       yes
+      100   15.9  0.0628 s    +949 %        0    0.0329   0.00316 s   31.6        no
     """
     caller = "suggest_step_size"
     require_stepper(caller, stepper)

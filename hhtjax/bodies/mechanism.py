@@ -557,7 +557,7 @@ def _onto_loops(caller: str, q: Array, linearized, move, turned_over):
     if not np.max(np.abs(Phi)) <= 1e-6:
         raise ValueError(
             f"{caller}: the loops cannot be closed from the described position: {np.max(np.abs(Phi)):.3g} m or "
-            "rad is left. Describe a position that is nearer, by `position` and `rotation` of the bodies. Bars that lie "
-            "in one line cannot leave it."
+            "rad is left. Describe a position that is nearer, by `position` and `rotation` of the bodies. Bars that "
+            "lie in one line cannot leave it."
         )
     return q, B

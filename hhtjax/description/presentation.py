@@ -115,6 +115,16 @@ def between(x: np.ndarray, unit: str = "", digits: int = 6) -> str:
     return (least if least == most else f"{least} ... {most}") + (f" {unit}" if unit else "")
 
 
+def frequency_cells(w: float) -> list[str]:
+    """A frequency in rad/s, the same in Hz, and its period, as cells of a table.
+
+    >>> frequency_cells(100.0), frequency_cells(0.0)
+    (['100', '15.9', '0.0628 s'], ['0', '0', '-'])
+    """
+    hertz = w / (2 * np.pi)
+    return [f"{w:.4g}", f"{hertz:.3g}", f"{1 / hertz:.3g} s" if hertz else "-"]
+
+
 def _shortened(table: Table):
     """At most `MOST` rows, and the number of omitted ones."""
     left = len(table.rows) - 1 - MOST

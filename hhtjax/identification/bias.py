@@ -71,7 +71,9 @@ class ModeBias(NamedTuple):
             return ""
         w, _, wh, stiffness, damping = numbers
         stiffness, damping = (between(100 * bias, "%", digits=3) for bias in (stiffness, damping))
-        frequencies = f"{w.size} mode{'s' * (w.size > 1)}, {between(w, 'rad/s')}, w h = {between(wh, digits=3)}"
+        hertz = between(w / (2 * np.pi), "Hz", digits=3)
+        modes = f"{w.size} mode{'s' * (w.size > 1)}"
+        frequencies = f"{modes}, {between(w, 'rad/s')} ({hertz}), w h = {between(wh, digits=3)}"
         return f"{frequencies}: stiffness off by {stiffness}, damping by {damping}"
 
 

@@ -23,7 +23,7 @@ except ModuleNotFoundError as error:
 from hhtjax.plot.convergence import error_against_h, work_precision
 from hhtjax.plot.fits import correlations as correlations
 from hhtjax.plot.fits import estimates, fit_overview, held_out, profile
-from hhtjax.plot.mechanisms import animation, configuration
+from hhtjax.plot.mechanisms import Film, animation, configuration
 from hhtjax.plot.records import fit_against_data
 from hhtjax.plot.steps import damping_ratio, period_elongation, spectral_radius, stability_region
 from hhtjax.plot.styles import COLOURS, LINES, MARKERS, PARAMETERS, legend, save, style, subplots
@@ -36,6 +36,7 @@ __all__ = [
     "LINES",
     "MARKERS",
     "PARAMETERS",
+    "Film",
     "animation",
     "configuration",
     "damping_ratio",

@@ -1,12 +1,14 @@
-"""Pictures of mechanisms, moving and still, from the points of their bars."""
+"""Pictures of scenes and mechanisms, moving and still."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
 import jax
+import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.animation import FuncAnimation
 from matplotlib.ticker import MaxNLocator
@@ -16,6 +18,8 @@ from hhtjax.checks import require_function, require_number
 from hhtjax.description import Real
 from hhtjax.plot.styles import COLOURS, canvas, legend, look, require_run, with_unit
 from hhtjax.runs.interpolate import interpolate
+from hhtjax.scenes import EventScene, InternalScene, Scene
+from hhtjax.scenes.drawings import Shape
 
 if TYPE_CHECKING:
     from hhtjax.runs.solution import Solution
@@ -30,15 +34,16 @@ def animation(
     trace: Any = None,
     unit: str | None = "m",
     ax: Any = None,
-) -> FuncAnimation:
-    """A film of a run: polylines through points that move, in the plane or in space.
+) -> Film:
+    """A film of a run: of a scene, a mechanism, or polylines through points that move, in the plane or in space.
 
     Frames are taken from dense output, at equal times, whatever the step size.
 
     Args:
         solution: of one run.
-        points: `points(q)` -> (k, 2) or (k, 3), the corners of a polyline; or a list or tuple of these. Or a
-            `hhtjax.bodies.Mechanism`, whose bodies are drawn as bars.
+        points: what is drawn. A scene of `hhtjax.scenes`, by its `drawing`; or a `hhtjax.bodies.Mechanism`, whose
+            bodies are bars; or `points(q)` -> (k, 2) or (k, 3), the corners of a polyline, or a list or tuple of these
+            and of shapes of `hhtjax.scenes.drawings`.
         fps: frames per second of film.
         speed: time of the run for each second of film.
         trace: number of a point of the first polyline whose path is drawn, or several.
@@ -46,24 +51,24 @@ def animation(
         ax: axes to draw into, for points in space with projection="3d"; None for a figure of its own.
 
     Returns:
-        A `FuncAnimation`: `.save("film.gif", writer="pillow")`, or `.to_jshtml()` in a notebook. Keep it, as matplotlib
-        forgets what nobody holds.
+        A `Film`, a `FuncAnimation` of matplotlib: `.save("film.gif")` writes a file, and as the last line of a cell it
+        plays in a notebook. Keep it until then, as matplotlib forgets what nobody holds.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind or value; points of another shape.
+        TypeError, ValueError: an argument of a wrong kind or value; points of another shape; a scene without a drawing.
 
     >>> import pathlib, tempfile, jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
-    >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -4.0 * q)
-    >>> run = hhtjax.simulate(spring, hhtjax.hht(), jnp.ones(1), jnp.zeros(1), dt=0.1, num_steps=10)
-    >>> figure, ax = hhtjax.plot.subplots()
-    >>> film = hhtjax.plot.animation(run, lambda q: jnp.array([[0.0, 0.0], [q[0], 0.0]]), fps=2, trace=1, ax=ax)
+    >>> scene = hhtjax.scenes.duffing.hardening_spring()
+    >>> run = hhtjax.simulate(
+    ...     scene.system, hhtjax.hht(), scene.q0, scene.v0, scene.params, dt=1e-3, num_steps=100)
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     film.save(pathlib.Path(folder) / "spring.gif", writer="pillow")
+    ...     hhtjax.plot.animation(run, scene, fps=20, speed=0.5).save(pathlib.Path(folder) / "spring.gif")
     ...     [path.name for path in pathlib.Path(folder).iterdir()]
     ['spring.gif']
-    >>> ax.get_title(), ax.lines[1].get_xdata().round(2).tolist()                        # the trace in the last frame
-    ('t = 1.00', [1.0, 0.54, -0.41])
-    >>> plt.close(figure)
+    >>> film = hhtjax.plot.animation(run, lambda q: jnp.array([[0.0, 0.0], [q[0], 0.0]]), fps=20, trace=1)
+    >>> len(film.to_jshtml()) > 10_000
+    True
+    >>> plt.close("all")
     """
     require_number("animation", "fps", fps, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
     require_number("animation", "speed", speed, lambda x: np.isfinite(x) and x > 0, "be positive and finite")
@@ -72,28 +77,42 @@ def animation(
     times = start + np.arange(int((end - start) / speed * fps + 1e-9) + 1) / fps * speed
     frames = _frames("animation", solution, points, np.minimum(times, end))
     traced = [] if trace is None else [int(i) for i in np.ravel(trace)]
-    if any(not -len(frames[0][0]) <= i < len(frames[0][0]) for i in traced):
-        raise ValueError(
-            f"animation: `trace` must number points of the first polyline, {len(frames[0][0])}; received {trace!r}."
-        )
+    most = len(frames[0][0].points)
+    if any(not -most <= i < most for i in traced):
+        raise ValueError(f"animation: `trace` must number points of the first polyline, {most}; received {trace!r}.")
     with _scene("animation", ax, frames, unit) as panel:
-        bars = [panel.plot(*x.T, **_bar(i))[0] for i, x in enumerate(frames[0])]
-        paths = [panel.plot(*frames[0][0][[i]].T, color=COLOURS[1], lw=0.8)[0] for i in traced]
-        title = panel.set_title(f"t = {times[0]:.2f}")
+        bars = [panel.plot(*x.points.T, **_look(i, x.kind))[0] for i, x in enumerate(frames[0])]
+        paths = [panel.plot(*frames[0][0].points[[i]].T, color=COLOURS[1], lw=0.8)[0] for i in traced]
+        told = max(0, 2 - int(np.floor(np.log10(max(end - start, 1e-9)))))  # decimals: of a run of 1 s two
+        title = panel.set_title(f"t = {times[0]:.{told}f} s")
 
     def draw(k: int):
         for line, x in zip(bars, frames[k], strict=True):
-            _move(line, x)
+            _move(line, x.points)
         for line, i in zip(paths, traced, strict=True):
-            _move(line, np.stack([frame[0][i] for frame in frames[: k + 1]]))
-        title.set_text(f"t = {times[k]:.2f}")
+            _move(line, np.stack([frame[0].points[i] for frame in frames[: k + 1]]))
+        title.set_text(f"t = {times[k]:.{told}f} s")
         return [*bars, *paths, title]
 
-    return FuncAnimation(panel.figure, draw, frames=len(frames), interval=1e3 / fps, blit=False)
+    return Film(panel.figure, draw, frames=len(frames), interval=1e3 / fps, blit=False)
+
+
+class Film(FuncAnimation):
+    """An animation that plays in a notebook, and whose GIF needs no other program; made by `animation`."""
+
+    def save(self, filename: Any, writer: Any = None, **options: Any):
+        """Writes a file, as `Animation.save` of matplotlib; without a writer, a .gif is written by Pillow."""
+        super().save(filename, "pillow" if writer is None and Path(filename).suffix == ".gif" else writer, **options)
+
+    def _repr_html_(self) -> str:
+        """The film with buttons. A notebook would show the figure again, below it: so it is closed."""
+        shown, film = self.to_jshtml(), cast(Any, self)  # of whose figure matplotlib's types do not know
+        plt.close(film._fig)
+        return shown
 
 
 def configuration(solution: Any, points: Any, times: Any, *, unit: str | None = "m", ax: Any = None) -> Any:
-    """A mechanism at some times, the earlier the paler.
+    """A scene or a mechanism at some times, the earlier the paler.
 
     Args:
         solution, points, unit, ax: as in `animation`.
@@ -120,34 +139,51 @@ def configuration(solution: Any, points: Any, times: Any, *, unit: str | None = 
         for k, (t, frame) in enumerate(zip(times, frames, strict=True)):
             for i, x in enumerate(frame):
                 shown = {"alpha": 1 - 0.75 * (len(frames) - 1 - k) / max(1, len(frames) - 1)}
-                panel.plot(*x.T, **_bar(i), **shown, label=f"t = {t:.3g}" if i == 0 else None)
+                panel.plot(*x.points.T, **_look(i, x.kind), **shown, label=f"t = {t:.3g} s" if i == 0 else None)
         legend(panel)
     return panel
 
 
-def _frames(caller: str, solution: Solution, points: Callable, times: np.ndarray):
-    """For each time a list of polylines, all of one dimension."""
-    points = points.bars() if isinstance(points, Mechanism) else points
-    require_function(caller, "points", points, "points(q)")
+def _frames(caller: str, solution: Solution, points: Any, times: np.ndarray) -> list[list[Shape]]:
+    """For each time the shapes, all of one dimension."""
+    shapes = _shapes(caller, points)
     q = interpolate(solution, times).q
     frames = []
-    for k in range(len(times)):
-        found = points(jax.tree.map(lambda x, k=k: x[k], q))
-        frames.append([np.asarray(x, float) for x in (found if isinstance(found, (list, tuple)) else [found])])
-    shapes = [x.shape for x in frames[0]]
-    if not shapes or any(len(s) != 2 or s[1] not in (2, 3) or s[1] != shapes[0][1] for s in shapes):
-        raise ValueError(f"{caller}: `points` must return (k, 2) or (k, 3), or a list of these; received {shapes}.")
+    for k, t in enumerate(times):
+        found = shapes(jax.tree.map(lambda x, k=k: x[k], q), float(t))
+        found = [found] if not isinstance(found, (list, tuple)) or isinstance(found, Shape) else found
+        frames.append([_as_shape(x) for x in found])
+    sizes = [x.points.shape for x in frames[0]]
+    if not sizes or any(len(s) != 2 or s[1] not in (2, 3) or s[1] != sizes[0][1] for s in sizes):
+        raise ValueError(f"{caller}: `points` must return (k, 2) or (k, 3), or a list of these; received {sizes}.")
     return frames
+
+
+def _shapes(caller: str, points: Any) -> Callable:
+    """A function of q and t."""
+    if isinstance(points, (Scene, EventScene, InternalScene)):
+        drawing, params = points.drawing, points.params
+        if drawing is None:
+            raise ValueError(f"{caller}: `points` is a {type(points).__name__} without a `drawing`: give it one.")
+        return lambda q, t: drawing(q, t, params)
+    points = points.bars() if isinstance(points, Mechanism) else points
+    require_function(caller, "points", points, "points(q)")
+    return lambda q, t: points(q)
+
+
+def _as_shape(x: Any) -> Shape:
+    """Points alone are those of a bar, in a colour of its own."""
+    return Shape(np.asarray(x.points, float), x.kind) if isinstance(x, Shape) else Shape(np.asarray(x, float), "")
 
 
 @contextmanager
 def _scene(caller: str, ax, frames: list, unit: str | None):
     """Axes of the right dimension, with limits that hold all frames and the same scale in every direction."""
-    spatial = frames[0][0].shape[1] == 3
+    spatial = frames[0][0].points.shape[1] == 3
     if ax is not None and spatial != hasattr(ax, "get_zlim"):
         wanted = 'projection="3d"' if spatial else "two dimensions"
         raise TypeError(f"{caller}: `ax` must be axes with {wanted}, as the points have; received {ax!r}.")
-    corners = np.concatenate([x for frame in frames for x in frame])
+    corners = np.concatenate([x.points for frame in frames for x in frame])
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = 0.06 * max(np.max(high - low), 1e-12)
     size = high - low + 2 * margin
@@ -169,8 +205,19 @@ def _height(width: Real, height: Real) -> Real:
     return min(max(25 + 65 * height / width, 40), 150)
 
 
-def _bar(i: int):
-    return look(i, marker=True) | {"ls": "-", "lw": 1.6, "ms": 3.5}
+LOOKS: dict[str, dict] = {  # of kinds of shapes
+    "bar": {"color": COLOURS[0], "marker": "o", "ms": 3.5, "lw": 1.6},
+    "body": {"color": COLOURS[1], "lw": 1.4},
+    "spring": {"color": COLOURS[2], "lw": 1.0},
+    "arrow": {"color": COLOURS[3], "lw": 1.2},
+    "ground": {"color": "#777777", "lw": 0.8, "zorder": 1.5},
+    "aim": {"color": "#777777", "lw": 1.0, "ls": "--", "zorder": 1.5},
+}
+
+
+def _look(i: int, kind: str) -> dict:
+    """Of a shape of a kind, or of the polyline with number i."""
+    return LOOKS[kind] if kind else look(i, marker=True) | {"ls": "-", "lw": 1.6, "ms": 3.5}
 
 
 def _move(line, x: np.ndarray):

@@ -10,8 +10,9 @@
 
 A scene of your own is a file with plain functions, `mass(q, params)` and `force(q, v, t, params)`, and at its end a
 function that returns a `Scene` of them with numbers in SI units, an `InternalScene`, which has a z0 too, or an
-`EventScene`, which has events. The docstring gives the equations and their source; the test compares with something
-that was not computed by this library: a closed form, a table in print, or SciPy.
+`EventScene`, which has events. With a `drawing`, made of the shapes of `hhtjax.scenes.drawings`, it can be drawn:
+`hhtjax.plot.animation(run, scene)`. The docstring gives the equations and their source; the test compares with
+something that was not computed by this library: a closed form, a table in print, or SciPy.
 """
 
 from hhtjax.scenes import arm as arm
@@ -21,6 +22,7 @@ from hhtjax.scenes import body_chain as body_chain
 from hhtjax.scenes import bouc_wen as bouc_wen
 from hhtjax.scenes import bump_stop as bump_stop
 from hhtjax.scenes import double_pendulum as double_pendulum
+from hhtjax.scenes import drawings as drawings
 from hhtjax.scenes import dry_oscillator as dry_oscillator
 from hhtjax.scenes import duffing as duffing
 from hhtjax.scenes import flexible_slider_crank as flexible_slider_crank

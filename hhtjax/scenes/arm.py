@@ -19,6 +19,7 @@ from hhtjax.bodies import Body, Joint, Mechanism, tree
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real
 from hhtjax.rotation import cross, exp
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import Scene
 from hhtjax.systems.system import System
 
@@ -101,4 +102,4 @@ def swing(joints: int = 6) -> Scene:
     """
     joints = int(require_number("swing", "joints", joints, lambda n: n in range(1, 7), "be 1, 2, ... 6"))
     arm = mechanism(joints)
-    return Scene(arm.system, arm.params, arm.q0 + np.array(START[:joints]), arm.v0, 2.0)
+    return Scene(arm.system, arm.params, arm.q0 + np.array(START[:joints]), arm.v0, 2.0, drawings.of_mechanism(arm))

@@ -9,8 +9,10 @@ T = sqrt(8 h/g), and the ball is at rest from T (1/2 + e/(1 - e)) on: infinitely
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.description import Array, PyTree, Real
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import EventScene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
@@ -43,6 +45,24 @@ def distance(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     return q[1] - q[0] - params["diameter"]
 
 
+@drawings.Drawing
+def ball_over_floor(q, t, params: PyTree):
+    """A ball of 5 cm, q over the floor at its lowest point."""
+    floor = params["floor"]
+    return [
+        drawings.wheel((0.0, q[0] + 0.05), 0.05),
+        drawings.ground((-0.4, floor), (0.4, floor), 0.04),
+    ]
+
+
+@drawings.Drawing
+def balls_on_a_line(q, t, params: PyTree):
+    """Two balls on a level floor."""
+    r = params["diameter"] / 2
+    start, end = np.array([-0.2, 0.0]), np.array([1.3, 0.0])
+    return [*(drawings.wheel((x, r), r) for x in q), drawings.ground(start, end, 0.04, 14)]
+
+
 def bouncing(restitution: Real = 0.8, drag: float = 0.1) -> EventScene:
     """Dropped from 1 m: two impacts in 1.5 s (SI units).
 
@@ -54,7 +74,7 @@ def bouncing(restitution: Real = 0.8, drag: float = 0.1) -> EventScene:
     """
     params = {"m": 1.0, "g": GRAVITY, "c": drag, "floor": 0.0, "e": restitution}
     events = (Event(height, reset=impact("e")),)
-    return EventScene(System(mass, weight_and_drag), params, array([1.0]), array([0.0]), 1.5, events)
+    return EventScene(System(mass, weight_and_drag), params, array([1.0]), array([0.0]), 1.5, events, ball_over_floor)
 
 
 def two(restitution: Real = 1.0) -> EventScene:
@@ -65,4 +85,6 @@ def two(restitution: Real = 1.0) -> EventScene:
     """
     params = {"m": 1.0, "diameter": 0.1, "e": restitution}
     events = (Event(distance, reset=impact("e")),)
-    return EventScene(System(mass, no_force), params, array([0.0, 0.5]), array([1.0, 0.0]), 1.0, events)
+    return EventScene(
+        System(mass, no_force), params, array([0.0, 0.5]), array([1.0, 0.0]), 1.0, events, balls_on_a_line
+    )

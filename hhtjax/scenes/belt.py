@@ -8,6 +8,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from hhtjax.description import PyTree
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
@@ -33,6 +34,24 @@ def limit(q, v, t, params: PyTree):
     return params["F"] * (1 + params["stiction"] * jnp.exp(-jnp.abs(sliding(q, v, t, params)) / params["vs"]))
 
 
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """The blocks on the belt, whose hatches move with it; they are 0.5 m apart where the springs are at rest."""
+    size, wall = 0.2, -0.5
+    first, second = q[0], q[1] + 0.5
+    low, middle = 0.3 * size, 0.6 * size  # heights of the springs
+    return [
+        drawings.block((first, size / 2), size, size),
+        drawings.block((second, size / 2), size, size),
+        drawings.spring((wall, middle), (first - size / 2, middle), 0.3 * size),
+        drawings.spring((first + size / 2, low), (second - size / 2, low), 0.3 * size),
+        drawings.spring((second + size / 2, middle), (1.0, middle), 0.3 * size),
+        drawings.wall_at(wall, size, -1),
+        drawings.wall_at(1.0, size, 1),
+        drawings.ground((-0.4, 0.0), (0.9, 0.0), 0.04, 13, shift=params["u"] * t / 0.1),
+    ]
+
+
 def two_masses() -> Scene:
     """25 switches in 5 s (SI units)."""
     params = {
@@ -40,4 +59,4 @@ def two_masses() -> Scene:
         "F": array([5.0, 4.0]), "stiction": 0.5, "vs": 0.1,
     }  # fmt: skip
     system = System(mass, force, friction=limit, sliding=sliding)
-    return Scene(system, params, array([0.1, 0.0]), array([0.0, 0.0]), 5.0)
+    return Scene(system, params, array([0.1, 0.0]), array([0.0, 0.0]), 5.0, drawing)

@@ -10,6 +10,7 @@ import numpy as np
 
 from hhtjax.bodies import Body, Joint, Mechanism, tree
 from hhtjax.checks import require_integer, require_number
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import Scene, array
 
 MASS, LENGTH, GYRATION, GRAVITY = 1.0, 0.5, 0.05, 9.81  # kg, m, radius of gyration about the axis in m, m/s^2
@@ -46,4 +47,5 @@ def body_chain(bodies=3, spin=5.0) -> Scene:
     R[0] = [[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]]
     spins = np.zeros((bodies, 3))
     spins[0, 2] = spin  # the others turn with it
-    return Scene(chain.system, chain.params, {"ball": array(R)}, {"ball": array(spins)}, 2.0)
+    start = {"ball": array(R)}, {"ball": array(spins)}
+    return Scene(chain.system, chain.params, *start, 2.0, drawings.of_mechanism(chain))

@@ -10,8 +10,10 @@ as beta gamma and beta delta only.
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.description import Array, PyTree, Real
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
@@ -53,6 +55,21 @@ def sampled_internal(q, v, z, t, params: PyTree):
 
 
 BENCHMARK = {"m": 2.0, "c": 10.0, "k": 5e4, "alpha": 5e4, "beta_gamma": 0.8e3, "beta_delta": -1.1e3}
+SIZE = 1e-3  # m, of the block in drawings
+
+
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """The mass and its spring; an arrow for the force."""
+    return drawings.on_a_spring(q[0], size=SIZE, force=np.sin(params["frequency"] * t))
+
+
+@drawings.Drawing
+def sampled_drawing(q, t, params: PyTree):
+    """The mass and its spring."""
+    return drawings.on_a_spring(q[0], size=SIZE)
+
+
 SAMPLED = System(sampled_mass, sampled_force, internal=sampled_internal)
 
 
@@ -60,7 +77,7 @@ def benchmark() -> InternalScene:
     """The benchmark's oscillator, driven at 30 Hz below its resonance (SI units)."""
     params = {**BENCHMARK, "amplitude": 100.0, "frequency": 2 * jnp.pi * 30.0}
     zero = array([0.0])
-    return InternalScene(System(mass, force, internal=internal), params, zero, zero, 0.1, zero)
+    return InternalScene(System(mass, force, internal=internal), params, zero, zero, 0.1, zero, drawing)
 
 
 def measured(params: PyTree, u, duration) -> InternalScene:
@@ -71,4 +88,4 @@ def measured(params: PyTree, u, duration) -> InternalScene:
         duration: s.
     """
     zero = array([0.0])
-    return InternalScene(SAMPLED, (params, u), zero, zero, duration, zero)
+    return InternalScene(SAMPLED, (params, u), zero, zero, duration, zero, sampled_drawing)

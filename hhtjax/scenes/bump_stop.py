@@ -9,8 +9,10 @@ jump. A stop holds on to the mass until it is back at the gap, as one whose own 
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.description import PyTree
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import EventScene, array
 from hhtjax.systems.events import Event
 from hhtjax.systems.system import System
@@ -58,13 +60,34 @@ def turn_lower(params: PyTree):
     return params | {"lower": 1 - params["lower"]}
 
 
+@drawings.Drawing
+def drawing_with_upper(q, t, params: PyTree):
+    """The mass on its spring, and the stop, whose plate it takes along."""
+    half, end = 0.1, params["gap"] + 0.5
+    plate = max(q[0], params["gap"]) + half
+    stop = drawings.spring((plate, half), (end, half), half), drawings.bar((plate, 0.04), (plate, 0.16))
+    return [*drawings.on_a_spring(q[0], size=2 * half), *stop, drawings.wall_at(end, 2 * half, 1)]
+
+
+@drawings.Drawing
+def drawing_with_both(q, t, params: PyTree):
+    """The mass between its two stops."""
+    size, gap = 0.008, params["gap"]
+    shapes = drawings.on_a_spring(q[0], size=size, force=np.cos(params["W"] * t), sprung=False)
+    for side in (-1, 1):
+        plate, end = side * (max(side * q[0], gap) + size / 2), side * 3.5 * size
+        shapes.append(drawings.spring((plate, size / 3), (end, size / 3), size / 3))
+        shapes.append(drawings.wall_at(end, size, side))
+    return shapes
+
+
 UPPER, LOWER = Event(before_upper, switch=turn_upper), Event(before_lower, switch=turn_lower)
 
 
 def bump_stop() -> EventScene:
     """Three strokes into a stop 0.3 m away, from 3 m/s, without a drive (SI units)."""
     params = {"m": 1.0, "k": 20.0, "A": 0.0, "W": 0.0, "K": 400.0, "C": 5.0, "gap": 0.3, "upper": 0.0}
-    return EventScene(System(mass, with_upper), params, array([0.0]), array([3.0]), 3.0, (UPPER,))
+    return EventScene(System(mass, with_upper), params, array([0.0]), array([3.0]), 3.0, (UPPER,), drawing_with_upper)
 
 
 def backlash() -> EventScene:
@@ -72,4 +95,5 @@ def backlash() -> EventScene:
     params = {
         "m": 1.0, "k": 0.0, "A": 20.0, "W": 20.0, "K": 1e4, "C": 20.0, "gap": 0.005, "upper": 0.0, "lower": 0.0,
     }  # fmt: skip
-    return EventScene(System(mass, with_both), params, array([0.0]), array([0.0]), 0.5, (UPPER, LOWER))
+    events = UPPER, LOWER
+    return EventScene(System(mass, with_both), params, array([0.0]), array([0.0]), 0.5, events, drawing_with_both)

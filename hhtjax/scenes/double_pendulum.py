@@ -11,8 +11,10 @@ from collections.abc import Callable
 from functools import cache, partial
 
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.description import Array, PyTree, Real
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import EventScene, Scene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
@@ -56,6 +58,13 @@ def force(q: Array, v: Array, t: Real, params: PyTree, trigonometry=jnp) -> Arra
     return weight_and_inertia(q, v, params, trigonometry) + jnp.array([first - second, second])
 
 
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """Both links."""
+    links = [length * np.array([np.cos(angle), np.sin(angle)]) for length, angle in zip(params["l"], q, strict=True)]
+    return [drawings.bar(np.zeros(2), links[0], links[0] + links[1])]
+
+
 @cache  # equal functions for equal systems
 def _using(trigonometry, function: Callable):
     return function if trigonometry is jnp else partial(function, trigonometry=trigonometry)
@@ -69,7 +78,7 @@ def free(trigonometry=jnp) -> Scene:
     """
     params = {"m": (1.0, 1.0), "l": (1.0, 1.5), "k": (0.0, 0.0), "c": (0.0, 0.0), "g": GRAVITY}
     system = System(_using(trigonometry, mass), _using(trigonometry, force))
-    return Scene(system, params, array([0.0, 0.0]), array([0.0, 0.0]), 10.0)
+    return Scene(system, params, array([0.0, 0.0]), array([0.0, 0.0]), 10.0, drawing)
 
 
 def stiff(as_printed: bool = False, trigonometry=jnp) -> Scene:
@@ -82,7 +91,7 @@ def stiff(as_printed: bool = False, trigonometry=jnp) -> Scene:
     params = {"m": (10.0, 1.0), "l": (1.0, 1.5), "k": (400.0, 300.0), "c": (15.0, 10000.0), "g": GRAVITY}
     torques = force_as_printed if as_printed else force
     system = System(_using(trigonometry, mass), _using(trigonometry, torques))
-    return Scene(system, params, array([0.0, 0.0]), array([0.0, 0.0]), 8.0)
+    return Scene(system, params, array([0.0, 0.0]), array([0.0, 0.0]), 8.0, drawing)
 
 
 def left_of_stop(q, v, t, params: PyTree):
@@ -102,4 +111,4 @@ def stopped(restitution: Real = 0.7) -> EventScene:
     scene = free()
     params = scene.params | {"stop": 0.2, "e": restitution}
     events = (Event(left_of_stop, reset=impact("e")),)
-    return EventScene(scene.system, params, scene.q0, scene.v0, 3.0, events)
+    return EventScene(scene.system, params, scene.q0, scene.v0, 3.0, events, drawing)

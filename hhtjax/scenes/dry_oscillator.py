@@ -8,8 +8,10 @@ Free, without damping and stiction, its motion is half cosines about F/k and -F/
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.description import Array, PyTree, Real
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
@@ -29,13 +31,20 @@ def limit(q: Array, v: Array, t: Real, params: PyTree):
     return params["F"] * (1 + params["stiction"] * jnp.exp(-jnp.abs(v) / params["vs"]))
 
 
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """The mass on its spring and the surface; an arrow for the force, where there is one."""
+    force = np.sin(params["W"] * t) if params["A"] else None
+    return drawings.on_a_spring(q[0], size=0.3, force=force)
+
+
 SYSTEM = System(mass, force, friction=limit)
 
 
 def free() -> Scene:
     """Five reversals, then it sticks (SI units)."""
     params = {"m": 1.0, "k": 100.0, "c": 0.0, "A": 0.0, "W": 0.0, "F": 4.0, "stiction": 0.0, "vs": 0.05}
-    return Scene(SYSTEM, params, array([0.5]), array([0.0]), 2.2)
+    return Scene(SYSTEM, params, array([0.5]), array([0.0]), 2.2, drawing)
 
 
 def driven(stiction: float = 0.3) -> Scene:
@@ -51,4 +60,4 @@ def driven(stiction: float = 0.3) -> Scene:
     0.5
     """
     params = {"m": 1.0, "k": 20.0, "c": 0.1, "A": 6.0, "W": 2.0, "F": 3.0, "stiction": stiction, "vs": 0.05}
-    return Scene(SYSTEM, params, array([0.0]), array([0.0]), 15.0)
+    return Scene(SYSTEM, params, array([0.0]), array([0.0]), 15.0, drawing)

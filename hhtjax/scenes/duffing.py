@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.description import Array, PyTree, Real
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
@@ -35,16 +37,29 @@ def sampled_mass(q: Array, params: PyTree) -> Array:
     return mass(q, params[0])
 
 
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """The mass on its spring; an arrow for the force, where there is one."""
+    force = np.cos(params["frequency"] * t) if params["amplitude"] else None
+    return drawings.on_a_spring(q[0], size=0.6, force=force)
+
+
+@drawings.Drawing
+def sampled_drawing(q, t, params: PyTree):
+    """The mass on its spring."""
+    return drawings.on_a_spring(q[0], size=0.1)
+
+
 def driven() -> Scene:
     """A hardening oscillator driven near its resonance (SI units)."""
     params = {"m": 1.0, "c": 0.2, "k": 1.0, "k2": 0.0, "k3": 1.0, "amplitude": 0.8, "frequency": 1.3}
-    return Scene(System(mass, force), params, array([0.5]), array([0.0]), 10.0)
+    return Scene(System(mass, force), params, array([0.5]), array([0.0]), 10.0, drawing)
 
 
 def hardening_spring() -> Scene:
     """A stiff hardening spring let go, 100 q + 10^4 q^3: where the predictor form fails first."""
     params = {"m": 1.0, "c": 0.0, "k": 100.0, "k2": 0.0, "k3": 1e4, "amplitude": 0.0, "frequency": 0.0}
-    return Scene(System(mass, force), params, array([1.0]), array([0.0]), 2.0)
+    return Scene(System(mass, force), params, array([1.0]), array([0.0]), 2.0, drawing)
 
 
 def measured(params: PyTree, u, q0: PyTree, v0: PyTree, duration) -> Scene:
@@ -56,6 +71,5 @@ def measured(params: PyTree, u, q0: PyTree, v0: PyTree, duration) -> Scene:
         q0, v0: numbers.
         duration: s.
     """
-    return Scene(
-        System(sampled_mass, sampled_force), (params, u), jnp.reshape(q0, (1,)), jnp.reshape(v0, (1,)), duration
-    )
+    start = jnp.reshape(q0, (1,)), jnp.reshape(v0, (1,))
+    return Scene(System(sampled_mass, sampled_force), (params, u), *start, duration, sampled_drawing)

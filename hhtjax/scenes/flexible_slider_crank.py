@@ -26,6 +26,7 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 
 from hhtjax.description import Array, PyTree, Real
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
@@ -97,6 +98,24 @@ def constraint(q: Array, t: Real, params: PyTree) -> Array:
     )
 
 
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """Crank, rod and slider, which runs on the x axis; the rod's displacements are to scale."""
+    l1, l2 = params["l"]
+    pin = l1 * np.array([np.cos(q[0]), np.sin(q[0])])
+    s = np.linspace(0, 1, 13)
+    across = q[3] * np.sin(PI * s) + q[4] * np.sin(2 * PI * s)
+    along = l2 * s + 4 * q[5] * s * (1 - s) + q[6] * s * (2 * s - 1)
+    c, d = np.cos(q[1]), np.sin(q[1])
+    rod = pin + np.stack([c * along - d * across, d * along + c * across], axis=-1)
+    return [
+        drawings.bar(np.zeros(2), pin),
+        drawings.Shape(rod, "spring"),
+        drawings.block((q[2], 0.0), 0.06, 0.04),
+        drawings.ground((0.1, -0.02), (0.5, -0.02), 0.015, 16),
+    ]
+
+
 def flexible_slider_crank(stiffening: bool = False, damping: bool = False) -> Scene:
     """From the stretched position the crank turns at 150 rad/s, by 15 rad; the rod hardly vibrates at first.
 
@@ -127,4 +146,4 @@ def flexible_slider_crank(stiffening: bool = False, damping: bool = False) -> Sc
     )
     q0 = array([0.0, 0.0, l1 + l2 + u2, 0.0, 0.0, u1, u2])
     v0 = array([150.0, -150.0 * l1 / (l2 + u2), u2_dot, w1_dot, w2_dot, u1_dot, u2_dot])
-    return Scene(System(mass, force, constraint), params, q0, v0, 0.1)
+    return Scene(System(mass, force, constraint), params, q0, v0, 0.1, drawing)

@@ -23,6 +23,7 @@ import numpy as np
 
 from hhtjax.checks import require_integer
 from hhtjax.description import Array, PyTree, Real
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
@@ -57,6 +58,18 @@ def constraint(q: Array, t: Real, params: PyTree) -> Array:
     return (jnp.sum(bars**2, axis=1) - params["l"] ** 2) / 2
 
 
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """Couplers, cranks, and the ground below each pivot."""
+    pivots = [np.array([i * params["l"], 0.0]) for i in range(len(q))]
+    side = np.array([0.15 * params["l"], 0.0])
+    return [
+        drawings.bar(*q),
+        *(drawings.bar(pivot, end) for pivot, end in zip(pivots, q, strict=True)),
+        *(drawings.ground(x - side, x + side, side[0] / 2, 4) for x in pivots),
+    ]
+
+
 def four_bars(loops: int = 2) -> Scene:
     """N = loops squares of 1 m bars of 1 kg, whose upper row starts at 1 m/s.
 
@@ -74,4 +87,4 @@ def four_bars(loops: int = 2) -> Scene:
     ones = np.ones_like(along)
     params = {"m": 1.0, "l": 1.0, "g": GRAVITY}
     q0, v0 = (array(np.stack(x, axis=1)) for x in ((along, ones), (ones, 0 * ones)))
-    return Scene(System(mass, force, constraint), params, q0, v0, 10.0)
+    return Scene(System(mass, force, constraint), params, q0, v0, 10.0, drawing)

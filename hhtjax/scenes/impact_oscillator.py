@@ -10,8 +10,10 @@ Phys. Lett. A 91 (1982).
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.description import PyTree, Real
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import EventScene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
@@ -32,6 +34,14 @@ def room(q, v, t, params: PyTree):
     return params["wall"] - q[0]
 
 
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """The mass on its spring, the stop on its right, and an arrow for the force."""
+    size = 0.3
+    shapes = drawings.on_a_spring(q[0], size=size, force=np.cos(params["W"] * t))
+    return [*shapes, drawings.wall_at(params["wall"] + size / 2, size, 1)]
+
+
 def driven(restitution: Real = 0.8) -> EventScene:
     """Stop at the middle of the oscillation, driven at 2.6 times the frequency without it (SI units).
 
@@ -40,4 +50,4 @@ def driven(restitution: Real = 0.8) -> EventScene:
     """
     params = {"m": 1.0, "c": 0.05, "k": 1.0, "A": 1.0, "W": 2.6, "wall": 0.0, "e": restitution}
     events = (Event(room, reset=impact("e")),)
-    return EventScene(System(mass, force), params, array([-0.5]), array([0.0]), 20.0, events)
+    return EventScene(System(mass, force), params, array([-0.5]), array([0.0]), 20.0, events, drawing)

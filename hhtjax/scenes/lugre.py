@@ -10,6 +10,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from hhtjax.description import PyTree
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
@@ -31,6 +32,19 @@ def force(q, v, z, t, params: PyTree):
     return params["k"] * (params["speed"] * t - q) - friction
 
 
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """The mass on the surface, and the spring, whose far end moves; it is drawn 0.5 m long where it is at rest."""
+    half = 0.1
+    end = params["speed"] * t + half + 0.5
+    return [
+        drawings.block((q[0], half), 2 * half, 2 * half),
+        drawings.spring((q[0] + half, half), (end, half), half),
+        drawings.arrow((end, half), (0.2, 0.0), 0.2),
+        drawings.ground((-0.2, 0.0), (1.9, 0.0), 0.04, 20),
+    ]
+
+
 def stick_slip() -> InternalScene:
     """The experiment of the source, Sec. III-C: 1 kg dragged at 0.1 m/s sticks and slips (SI units)."""
     params = {
@@ -38,4 +52,4 @@ def stick_slip() -> InternalScene:
         "coulomb": 1.0, "static": 1.5, "stribeck": 1e-3,
     }  # fmt: skip
     zero = array([0.0])
-    return InternalScene(System(mass, force, internal=internal), params, zero, zero, 10.0, zero)
+    return InternalScene(System(mass, force, internal=internal), params, zero, zero, 10.0, zero, drawing)

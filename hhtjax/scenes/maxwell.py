@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.description import PyTree
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
@@ -24,6 +26,22 @@ def internal(q, v, z, t, params: PyTree):
     return params["stiffness"] * v - z / params["tau"]
 
 
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """The mass on the mount, a spring beside rubber, which stands for the branches; an arrow for the force."""
+    size, wall = 0.02, -0.07
+    low, high = 0.25 * size, 0.7 * size
+    face = q[0] - size / 2
+    return [
+        drawings.block((q[0], size / 2), size, size),
+        drawings.block(((wall + face) / 2, low), face - wall, 0.4 * size),
+        drawings.spring((wall, high), (face, high), 0.3 * size),
+        drawings.arrow((q[0] + size / 2, size / 2), (size * np.cos(params["frequency"] * t), 0.0), size),
+        drawings.wall_at(wall, size, -1),
+        drawings.ground((wall, 0.0), (0.05, 0.0), 0.2 * size, 12),
+    ]
+
+
 def vibration() -> InternalScene:
     """A rubber mount, driven near its resonance; the branches relax in 1 s, 30 ms and 0.1 ms (SI units)."""
     params = {
@@ -31,4 +49,4 @@ def vibration() -> InternalScene:
         "stiffness": array([100.0, 200.0, 1e4]), "tau": array([1.0, 3e-2, 1e-4]),
     }  # fmt: skip
     system = System(mass, force, internal=internal)
-    return InternalScene(system, params, array([0.01]), array([0.0]), 2.0, array([0.5, 0.0, 0.0]))
+    return InternalScene(system, params, array([0.01]), array([0.0]), 2.0, array([0.5, 0.0, 0.0]), drawing)

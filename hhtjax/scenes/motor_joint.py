@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.description import Array, PyTree, Real
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import InternalScene, array
 from hhtjax.systems.system import System
 
@@ -31,6 +33,22 @@ def internal(q: Array, v: Array, z: dict, t: Real, params: PyTree):
     return {"current": current, "integral": error}
 
 
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """The link of 0.5 m, the motor it sits on, and the angle that it is to have, dashed."""
+
+    def end(angle):
+        return 0.5 * np.array([np.sin(angle), -np.cos(angle)])
+
+    pivot = np.zeros(2)
+    return [
+        drawings.bar(pivot, end(q[0])),
+        drawings.wheel(pivot, 0.05),
+        drawings.aim(pivot, end(params["amplitude"] * np.sin(params["frequency"] * t))),
+        drawings.ground((0.15, 0.05), (-0.15, 0.05), 0.04, 6),
+    ]
+
+
 def tracking() -> InternalScene:
     """A link of 1 kg and 0.5 m follows a sine; the current, L/R = 1 ms, is far faster than the motion (SI units)."""
     params = {
@@ -39,6 +57,5 @@ def tracking() -> InternalScene:
         "kp": 60.0, "ki": 40.0, "kd": 2.0, "amplitude": 1.0, "frequency": 3.0,
     }  # fmt: skip
     zero = array([0.0])
-    return InternalScene(
-        System(mass, force, internal=internal), params, zero, zero, 2.0, {"current": zero, "integral": zero}
-    )
+    system, z0 = System(mass, force, internal=internal), {"current": zero, "integral": zero}
+    return InternalScene(system, params, zero, zero, 2.0, z0, drawing)

@@ -15,6 +15,7 @@ import numpy as np
 
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import EventScene, Scene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
@@ -54,6 +55,28 @@ def moment_of_weight(q, v, t, params: PyTree):
     return -params["m"] * params["g"] * params["l"] * jnp.sin(q)
 
 
+@drawings.Drawing
+def drawing_cartesian(q, t, params: PyTree):
+    """The rod; the wall, where there is one."""
+    shapes = [drawings.bar(np.zeros(2), q)]
+    if "wall" in params:
+        x, length = params["wall"], params["l"]
+        shapes.append(drawings.ground((x, -1.1 * length), (x, 0.0), 0.05 * length))
+    return shapes
+
+
+@drawings.Drawing
+def drawing_elastic(q, t, params: PyTree):
+    """The spring, and the mass as a small ball."""
+    return [drawings.spring(np.zeros(2), q, 0.1 * params["l"]), drawings.wheel(q, 0.04 * params["l"])]
+
+
+@drawings.Drawing
+def drawing_minimal(q, t, params: PyTree):
+    """The rod."""
+    return [drawings.bar(np.zeros(2), params["l"] * np.array([np.sin(q[0]), -np.cos(q[0])]))]
+
+
 def cartesian(speed: float = 2.505, length: float = 0.5) -> Scene:
     """The rod as a constraint.
 
@@ -64,7 +87,8 @@ def cartesian(speed: float = 2.505, length: float = 0.5) -> Scene:
         TypeError, ValueError: speed is no finite number, length no positive one.
     """
     params = _params("cartesian", speed, length)
-    return Scene(System(point_mass, weight, rod), params, array([0.0, -length]), array([speed, 0.0]), DURATION)
+    start = array([0.0, -length]), array([speed, 0.0])
+    return Scene(System(point_mass, weight, rod), params, *start, DURATION, drawing_cartesian)
 
 
 def elastic(k: float = 1e6, speed: float = 2.505, length: float = 0.5) -> Scene:
@@ -84,7 +108,8 @@ def elastic(k: float = 1e6, speed: float = 2.505, length: float = 0.5) -> Scene:
     params["k"] = require_number("elastic", "k", k, lambda x: 0 < x < np.inf, "be positive and finite")
     b = k * length + params["m"] * GRAVITY
     r = (b + jnp.sqrt(b**2 + 4 * k * params["m"] * speed**2)) / (2 * k)
-    return Scene(System(point_mass, weight_and_spring), params, array([0.0, -r]), array([speed, 0.0]), DURATION)
+    start = array([0.0, -r]), array([speed, 0.0])
+    return Scene(System(point_mass, weight_and_spring), params, *start, DURATION, drawing_elastic)
 
 
 def minimal(speed: float = 2.505, length: float = 0.5) -> Scene:
@@ -97,7 +122,8 @@ def minimal(speed: float = 2.505, length: float = 0.5) -> Scene:
         TypeError, ValueError: as `cartesian`.
     """
     params = _params("minimal", speed, length)
-    return Scene(System(inertia, moment_of_weight), params, array([0.0]), array([speed / length]), DURATION)
+    start = array([0.0]), array([speed / length])
+    return Scene(System(inertia, moment_of_weight), params, *start, DURATION, drawing_minimal)
 
 
 def room_before_wall(q, v, t, params: PyTree):
@@ -119,7 +145,7 @@ def walled(wall: float = 0.3, restitution: Real = 0.7) -> EventScene:
     require_number("walled", "wall", wall, lambda x: 0 < x < length, "be positive and less than the rod's 0.5")
     params = scene.params | {"wall": wall, "e": restitution}
     events = (Event(room_before_wall, reset=impact("e")),)
-    return EventScene(scene.system, params, scene.q0, scene.v0, DURATION, events)
+    return EventScene(scene.system, params, scene.q0, scene.v0, DURATION, events, drawing_cartesian)
 
 
 def _params(caller: str, speed: float, length: float):

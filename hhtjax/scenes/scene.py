@@ -9,6 +9,7 @@ import numpy as np
 
 from hhtjax.description import Array, PyTree, all_concrete
 from hhtjax.description.presentation import shown
+from hhtjax.scenes.drawings import Drawing
 from hhtjax.systems.events import Event
 from hhtjax.systems.system import LinearSystem, System
 
@@ -21,6 +22,7 @@ class Scene(NamedTuple):
         system, params: what moves.
         q0, v0: initial position and velocity.
         duration: s.
+        drawing: a `hhtjax.scenes.drawings.Drawing`, what `hhtjax.plot.animation` draws; or None.
     """
 
     system: System | LinearSystem
@@ -28,6 +30,7 @@ class Scene(NamedTuple):
     q0: PyTree
     v0: PyTree
     duration: float
+    drawing: Drawing | None = None
 
 
 @shown
@@ -39,6 +42,7 @@ class EventScene(NamedTuple):
         q0, v0: initial position and velocity.
         duration: s.
         events: what happens on the way, a tuple of `Event`.
+        drawing: a `hhtjax.scenes.drawings.Drawing`, what `hhtjax.plot.animation` draws; or None.
     """
 
     system: System | LinearSystem
@@ -47,6 +51,7 @@ class EventScene(NamedTuple):
     v0: PyTree
     duration: float
     events: tuple[Event, ...]
+    drawing: Drawing | None = None
 
 
 @shown
@@ -57,6 +62,7 @@ class InternalScene(NamedTuple):
         system, params: what moves.
         q0, v0, z0: initial position, velocity and internal states.
         duration: s.
+        drawing: a `hhtjax.scenes.drawings.Drawing`, what `hhtjax.plot.animation` draws; or None.
     """
 
     system: System
@@ -65,6 +71,7 @@ class InternalScene(NamedTuple):
     v0: PyTree
     duration: float
     z0: PyTree
+    drawing: Drawing | None = None
 
 
 def array(values: PyTree) -> Array:

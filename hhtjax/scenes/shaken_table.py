@@ -16,8 +16,10 @@ J. Guckenheimer, P. Holmes, Nonlinear Oscillations, Dynamical Systems, and Bifur
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.description import PyTree
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import EventScene, array
 from hhtjax.systems.events import Event, impact
 from hhtjax.systems.system import System
@@ -66,7 +68,17 @@ def leave(params: PyTree):
     return params | {"on": 0 * params["on"]}
 
 
-LANDING, LEAVING = Event(before_landing, reset=impact(0.0), switch=land), Event(before_leaving, switch=leave)
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """The body, and the table at its height."""
+    size, height = 0.1, params["A"] * np.sin(params["W"] * t)
+    return [
+        drawings.block((0.0, q[0] + size / 2), size, size),
+        drawings.ground((-2 * size, height), (2 * size, height), 0.2 * size),
+    ]
+
+
+EVENTS = LANDING, LEAVING = Event(before_landing, reset=impact(0.0), switch=land), Event(before_leaving, switch=leave)
 
 
 def shaken_table(strength: float = 2.0) -> EventScene:
@@ -80,4 +92,4 @@ def shaken_table(strength: float = 2.0) -> EventScene:
     """
     params = {"m": 0.5, "g": GRAVITY, "A": strength * GRAVITY / 100.0, "W": 10.0, "on": 1.0}
     v0 = array([10.0 * params["A"], 0.0])
-    return EventScene(System(mass, weight, contact), params, array([0.0, 0.0]), v0, 1.3, (LANDING, LEAVING))
+    return EventScene(System(mass, weight, contact), params, array([0.0, 0.0]), v0, 1.3, EVENTS, drawing)

@@ -10,8 +10,10 @@ g acts along -y. A spring k and a damper c act on the slider, the spring at rest
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 
 from hhtjax.description import Array, PyTree, Real
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
@@ -46,6 +48,22 @@ def constraint(q: Array, t: Real, params: PyTree) -> Array:
     )
 
 
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """Crank, rod and slider, which runs on the x axis; its spring, where there is one."""
+    l1 = params["l"][0]
+    pin = l1 * np.array([np.cos(q[0]), np.sin(q[0])])
+    wide, high = 0.1, 0.06
+    shapes = [
+        drawings.bar(np.zeros(2), pin, (q[2], 0.0)),
+        drawings.block((q[2], 0.0), wide, high),
+        drawings.ground((0.2, -high / 2), (0.75, -high / 2), 0.02, 16),
+    ]
+    if not params["k"]:
+        return shapes
+    return [*shapes, drawings.spring((q[2] + wide / 2, 0.0), (0.95, 0.0), 0.04), drawings.wall_at(0.95, high, 1)]
+
+
 def free() -> Scene:
     """No spring, no damper, no moment: the crank, stretched out at first, turns on from 20 rad/s."""
     return _turning(20.0)
@@ -62,4 +80,4 @@ def _turning(speed: float, **loads: float) -> Scene:
     params = {"m": (0.5, 1.0, 0.8), "l": (l1, l2), "g": GRAVITY, "rest": l2}
     params |= {"moment": 0.0, "k": 0.0, "c": 0.0} | loads
     v0 = array([speed, -speed * l1 / l2, 0.0])
-    return Scene(System(mass, force, constraint), params, array([0.0, 0.0, l1 + l2]), v0, 1.0)
+    return Scene(System(mass, force, constraint), params, array([0.0, 0.0, l1 + l2]), v0, 1.0, drawing)

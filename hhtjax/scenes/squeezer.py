@@ -22,6 +22,7 @@ from jax.scipy.linalg import block_diag
 
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
@@ -99,6 +100,30 @@ def constraint(q: Array, t: Real, params: PyTree) -> Array:
     )
 
 
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """The bars, K1 and K2 first, in the order of their branches, and the spring."""
+    beta, theta, gamma, _, delta, _, epsilon = q
+    A, B, C = (params[x] for x in "ABC")
+
+    def along(angle):
+        return np.array([np.cos(angle), np.sin(angle)])
+
+    def across(angle):
+        return np.array([-np.sin(angle), np.cos(angle)])
+
+    crank = params["rr"] * along(beta)
+    P = crank - params["d"] * along(beta + theta)
+    held = B + params["sd"] * along(gamma) - params["sc"] * across(gamma)
+    return [
+        drawings.bar(np.zeros(2), crank, P),
+        drawings.bar(B, P, held, B),
+        drawings.bar(A, A + params["zt"] * along(delta), P),
+        drawings.bar(A, A - params["u"] * across(epsilon), P),
+        drawings.spring(held, C, 0.008),
+    ]
+
+
 def squeezer(moment: float = 0.033) -> Scene:
     """From rest, under a constant moment on the crank, N m; two and a half turns in 0.03 s with the default one.
 
@@ -124,4 +149,4 @@ def squeezer(moment: float = 0.033) -> Scene:
     params |= {"zf": 0.02, "fa": 0.01421, "u": 0.04, "ua": 0.01228, "ub": 0.00449}  # K6, K7
     gamma, phi, delta, epsilon = 0.455279819163070380, 0.222668390165885885, 0.487364979543842550, 1.23054744454982119
     q0 = array([-0.0617138900142764496, 0.0, gamma, phi, delta, -phi, epsilon])
-    return Scene(System(mass, force, constraint), params, q0, array(np.zeros(7)), 0.03)
+    return Scene(System(mass, force, constraint), params, q0, array(np.zeros(7)), 0.03, drawing)

@@ -20,6 +20,7 @@ from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real
 from hhtjax.numerics.dense_lu import matvec
 from hhtjax.rotation import cross
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.system import System
 
@@ -65,6 +66,19 @@ def rod(q: dict, t: Real, params: PyTree) -> Array:
     return q["x"] - params["l"] * q["R"][:, 1]
 
 
+@drawings.Drawing
+def drawing_minimal(R, t, params: PyTree):
+    """The rod, and the disk with one spoke, which shows the spin."""
+    x, a = params["l"] * R[:, 1], params["a"]
+    return [drawings.bar(np.zeros(3), x), drawings.wheel(x, a, R[:, 0], R[:, 2])]
+
+
+@drawings.Drawing
+def drawing_constrained(q, t, params: PyTree):
+    """The same, where the disk is."""
+    return [drawings.bar(np.zeros(3), q["x"]), drawings.wheel(q["x"], params["a"], q["R"][:, 0], q["R"][:, 2])]
+
+
 def minimal(spin: float = 150.0, inclination: float = 0.0) -> Scene:
     """The top as a rotation alone.
 
@@ -78,7 +92,7 @@ def minimal(spin: float = 150.0, inclination: float = 0.0) -> Scene:
         TypeError, ValueError: an argument is no finite number.
     """
     params, R, Om = _start("minimal", spin, inclination)
-    return Scene(System(inertia, moment), params, array(R), array(spin * Om), DURATION)
+    return Scene(System(inertia, moment), params, array(R), array(spin * Om), DURATION, drawing_minimal)
 
 
 def constrained(spin: float = 150.0, inclination: float = 0.0) -> Scene:
@@ -94,7 +108,7 @@ def constrained(spin: float = 150.0, inclination: float = 0.0) -> Scene:
     arm = params["l"] * np.array([0.0, 1.0, 0.0])
     q0, v0 = {"R": R, "x": R @ arm}, {"R": spin * Om, "x": spin * (R @ np.cross(Om, arm))}
     q0, v0 = jax.tree.map(array, (q0, v0))
-    return Scene(System(mass, force, rod), params, q0, v0, DURATION)
+    return Scene(System(mass, force, rod), params, q0, v0, DURATION, drawing_constrained)
 
 
 def _start(caller: str, spin: float, inclination: float):

@@ -16,11 +16,13 @@ tyre is relieved of all its static load, as on the default one.
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hhtjax.checks import require_number
 from hhtjax.description import Array, PyTree, Real
+from hhtjax.scenes import drawings
 from hhtjax.scenes.scene import Scene, array
 from hhtjax.systems.sampled import sampled
 from hhtjax.systems.system import System
@@ -124,6 +126,29 @@ def road(
     return heights.reshape(4, samples).T
 
 
+@jax.jit  # one program instead of one for each operation
+def road_at(road, t):
+    """Heights under the wheels, (4,)."""
+    return road(t)
+
+
+@drawings.Drawing
+def drawing(q, t, params: PyTree):
+    """The body as a plate, with springs to the wheels, and the road under each wheel; heights are to scale."""
+    high, r = 0.7, 0.3  # of the body over the ground, and of a wheel, m
+    x, y = params["x"], params["y"]
+    corners = np.stack([x, y, high + q[0] - x * q[1] + y * q[2]], axis=-1)
+    centres = np.stack([x, y, r + q[3:]], axis=-1)
+    below = np.stack([x, y, road_at(params["road"], t)], axis=-1)
+    length = np.array([r, 0, 0])
+    return [
+        drawings.Shape(corners[[0, 1, 3, 2, 0]], "body"),
+        *(drawings.wheel(centre, r, up=(0, 0, 1), along=(1, 0, 0)) for centre in centres),
+        *(drawings.spring(*ends, 0.12) for ends in zip(centres, corners, strict=True)),
+        *(drawings.Shape(np.stack([foot - length, foot + length]), "ground") for foot in below),
+    ]
+
+
 def ride(
     speed: float = 10.0, duration: Real = 4.0, roughness: float = 64e-6, bump: float = 0.05, seed: int = 0
 ) -> Scene:
@@ -154,4 +179,4 @@ def ride(
         "k_tyre": array(np.full(4, 200e3)),
         "road": sampled(road(speed, duration, roughness, bump, seed, front + rear), SAMPLING_PERIOD),
     }
-    return Scene(System(mass, force), params, array(np.zeros(7)), array(np.zeros(7)), duration)
+    return Scene(System(mass, force), params, array(np.zeros(7)), array(np.zeros(7)), duration, drawing)
