@@ -22,7 +22,7 @@ yaw, then a pitch and a roll about the axes as they are turned. They work under 
 >>> bool(jnp.allclose(back, R, atol=1e-6)), bool(jnp.allclose(Rotation.from_euler("Z", jnp.pi / 2).as_matrix(), R))
 (True, True)
 
-For rotation vectors use `exp` and `log`: derivatives of `from_rotvec`, `as_rotvec` and `magnitude` of JAX are NaN at the
+For rotation vectors use `exp` and `log`: derivatives of JAX's `from_rotvec`, `as_rotvec` and `magnitude` are NaN at the
 identity. Euler angles have no derivative at gimbal lock, for "ZYX" a pitch of +-90 degrees, and `as_euler` does not
 report it. A quaternion and its negative are one rotation. Along a motion `as_quat` may change from one to the other;
 with `canonical=True` w is not negative.
