@@ -311,8 +311,7 @@ def without_layer(
 ) -> Found:
     """The result of `finish` for the implicit step: a `Found`. factorize: `factors`, if they are known.
 
-    Small matrices are formed once. What is differentiated then consists of products with these, and of the force in one
-    place.
+    Small matrices are formed once. Only products with these and the force in one place are then differentiated.
     """
     options = method.options
 
@@ -584,9 +583,8 @@ def lag_left(layer: Layer, inverse: Callable):
 
 
 def rate_of(layer: Layer, s: State, inverse: Callable, h: Array) -> Array:
-    """(dw/dt, dL/dt) at the state s, by the same corrections: a difference quotient over a time far below h, which is
-    sufficient for first order in h. A derivative would need the third derivative of the constraints, and compile for
-    long."""
+    """(dw/dt, dL/dt) at the state s, by the same corrections: a difference quotient over a time far below h, enough for
+    first order in h. A derivative would need the third one of the constraints, and compile for long."""
     system, params = layer.system, layer.params
 
     def rows(later: Array) -> Array:
