@@ -244,8 +244,7 @@ def _is_far(B, away, start):
 
 @Programs
 def _turns(system, q0: PyTree, v0: PyTree, t0, params: PyTree, z0: PyTree):
-    """By how much a displacement of size 1 turns the gradient of each constraint, in the norm of diag(M), and that
-    norm."""
+    """How much a displacement of size 1 turns the gradient of each constraint, in the norm of diag(M); the norm."""
     flat, q, _ = flatten("simulate", system, q0, v0, t0, params, z0)
     t = jnp.asarray(t0).astype(q.dtype)
     d = diagonal(flat.mass(q, t, params))
@@ -315,8 +314,7 @@ def initial_values(caller: str, system, q0: PyTree, v0: PyTree, z0: PyTree = Non
 
 
 def _as_state(x: Real, dtype: np.dtype) -> Array:
-    """An array of JAX with this dtype. An array that already has it is returned as it is, since a conversion takes JAX
-    7 us."""
+    """An array of JAX with this dtype; the same array if it has it already, since a conversion takes 7 us."""
     return x if isinstance(x, jax.Array) and x.dtype == dtype and not x.weak_type else jnp.asarray(x, dtype)
 
 
