@@ -38,8 +38,8 @@ ERRORS = [
 ]
 UNEVEN = np.arange(9.0) ** 1.5
 TIMES = [
-    (ValueError, "give either `times`, or dt and t0; received times with dt=0.25, t0=0.0.", {"dt": DT}),
-    (ValueError, "give either `times`, or dt and t0; received times with dt=None, t0=1.0.", {"t0": 1.0}),
+    (ValueError, "must be given without dt and t0; received dt=0.25, t0=0.0 too.", {"dt": DT}),
+    (ValueError, "must be given without dt and t0; received dt=None, t0=1.0 too.", {"t0": 1.0}),
     (TypeError, "`times` must be real numbers; received an array of complex128.", {"times": 1j * UNEVEN}),
     (ValueError, "`times` must have shape (9,), one for each sample; received shape (8,).", {"times": UNEVEN[:-1]}),
     (ValueError, "`times` must have shape (9,), one for each sample; received shape ().", {"times": 0.1}),

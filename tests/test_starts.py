@@ -49,7 +49,7 @@ def test_the_equation_of_motion_from_samples_at_any_times():
 
     for found in (estimate(times, times=times), estimate(0.3 + 0.01 * np.arange(1000), dt=0.01, t0=0.3)):
         np.testing.assert_allclose([found["k"], found["c"]], [9.01, 0.2], rtol=0.01)
-    with pytest.raises(ValueError, match=r"sampled: give either `times`, or dt and t0; received times with dt=0.1"):
+    with pytest.raises(ValueError, match=r"sampled: `times` must be given without dt and t0; received dt=0.1"):
         hhtjax.equation_error(spring, times[:, None], 0.1, 5.0, times=times)
     with pytest.raises(TypeError, match="`cutoff` must be a real number; received None"):
         hhtjax.equation_error(spring, times[:, None], times=times)

@@ -188,7 +188,7 @@ def _grid(values: Array, dt: Real, t0: Real, times: Real):
         require_number("sampled", "t0", t0, np.isfinite, "be finite")
         return None, *(jnp.asarray(x).astype(values.dtype) for x in (dt, t0))
     if dt is not None or not (is_real(t0) and is_concrete(t0) and np.ndim(t0) == 0 and t0 == 0):
-        raise ValueError(f"sampled: give either `times`, or dt and t0; received times with dt={dt!r}, t0={t0!r}.")
+        raise ValueError(f"sampled: `times` must be given without dt and t0; received dt={dt!r}, t0={t0!r} too.")
     times = times if is_array(times) else np.asarray(times)
     if not is_real(times):
         raise TypeError(f"sampled: `times` must be real numbers; received an array of {times.dtype}.")
