@@ -338,3 +338,19 @@ def test_coordinates_of_bounds_and_back(dtype):
     np.testing.assert_allclose(T.bend(x), second / first, rtol=1e-4, atol=1e-6)
     for far in (-1e4, 1e4):
         assert T.contains(T.parameter(jnp.full(4, far, dtype), 1.0)).all()
+
+
+def test_bounded_parameters_as_free_numbers_and_back():
+    transforms = {"k": hhtjax.positive, "c": hhtjax.bounded(0, 1), "m": hhtjax.fixed}
+    params = {"k": jnp.array([2.0, 3.0]), "c": 0.25, "m": 7.0}
+    free = hhtjax.identification.unconstrained(params, transforms)
+    assert free.x0.shape == (3,)
+    jax.tree.map(lambda p, given: np.testing.assert_allclose(p, given, rtol=1e-12), free.params(free.x0), params)
+    far = free.params(free.x0 - 50)
+    assert 0 < far["c"] < 1e-12
+    assert float(far["m"]) == 7
+    assert np.all((far["k"] > 0) & (far["k"] < 1e-12))
+    with pytest.raises(ValueError, match="unconstrained: `transforms` must leave a parameter free"):
+        hhtjax.identification.unconstrained({"m": 7.0}, hhtjax.fixed)
+    with pytest.raises(ValueError, match=r"unconstrained: `params0\['c'\]` must lie between 0.0 and 1.0"):
+        hhtjax.identification.unconstrained(params | {"c": 2.0}, transforms)

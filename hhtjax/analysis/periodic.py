@@ -107,7 +107,8 @@ def periodic_solution(
     derivative of the run. It finds unstable motions too.
 
     The motion is periodic to rounding for these steps. It differs from that of the system by the error of the stepper:
-    with `dop853` or `tsit5` some hundred steps are accurate, with `hht` of order 2 more are needed.
+    some hundred steps of `tsit5` or `dop853` are accurate, `hht` needs more. A run of `hht` over many periods differs
+    from it by that error too, as it begins with an acceleration but once.
 
     Args:
         system: a `System`, `LinearSystem` or `FirstOrderSystem`, without constraints, rotations, dry friction and
