@@ -108,7 +108,7 @@ def periodic_solution(
 
     The motion is periodic to rounding for these steps. It differs from that of the system by the error of the stepper:
     some hundred steps of `tsit5` or `dop853` are accurate, `hht` needs more. A run of `hht` over many periods differs
-    from it by that error too, as it begins with an acceleration but once.
+    from it by that error too: only its first step starts from the acceleration of the equations of motion.
 
     Args:
         system: a `System`, `LinearSystem` or `FirstOrderSystem`, without constraints, rotations, dry friction and
