@@ -63,13 +63,13 @@ PICTURES = {
     "four_bars": Picture(
         scenes.four_bars.four_bars,
         "A row of two four-bar loops falls to its right; when all bars lie on one line, the loops could fold.",
-        (0.0, 0.4, 0.7),
+        (0.0, 0.3, 0.5),
     ),
     "slider_crank": Picture(
         scenes.slider_crank.driven,
         "A moment turns the crank, the rod pushes the slider, and a spring and a damper hold it back.",
-        (0.0, 0.2, 0.28),
-        labels={(0, 1): "crank, rod", (1, 2): "slider"},
+        (0.0, 0.15),
+        labels={(1, 2): "slider"},
     ),
     "flexible_slider_crank": Picture(
         scenes.flexible_slider_crank.flexible_slider_crank,
@@ -82,7 +82,7 @@ PICTURES = {
         "Seven bodies in three loops: a moment turns the small crank at the origin, and a spring pulls at one branch.",
         (0.0, 0.015),
         labels={(1, 0): "B", (2, 0): "A", (0, 2): "P", (4, -1): "C"},
-        film=(20, 0.004),
+        film=(10, 0.006),
     ),
     "arm": Picture(
         scenes.arm.swing,
@@ -117,7 +117,7 @@ PICTURES = {
     "maxwell": Picture(
         scenes.maxwell.vibration,
         "A mass on a rubber mount, a spring beside material that relaxes, driven near its resonance.",
-        (0.1,),
+        (0.29,),
         ONE,
         {(0, None): "m", (1, None): "rubber", (2, None): "k", (3, 1): "force"},
     ),
@@ -159,7 +159,7 @@ PICTURES = {
         "A body rides on a table that shakes, is thrown off, flies, and lands.",
         (0.3,),
         {"height (m)": 0},
-        film=(20, 0.4),
+        film=(12, 0.4),
     ),
     "impact_oscillator": Picture(
         scenes.impact_oscillator.driven,
