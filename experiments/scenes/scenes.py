@@ -98,7 +98,7 @@ PICTURES = {
     "bouc_wen": Picture(
         scenes.bouc_wen.benchmark,
         "A mass on a spring with hysteresis, driven below its resonance.",
-        (0.025,),
+        (0.01,),
         ONE,
         DRIVEN,
     ),
