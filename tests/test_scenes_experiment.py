@@ -17,12 +17,11 @@ def test_every_scene_has_a_picture_in_the_gallery_and_in_the_reference():
     reference = (ROOT / "docs" / "api" / "scenes.rst").read_text()
     for name, picture in PICTURES.items():
         assert (HERE / f"scenes_{name}.png").is_file()
-        assert (HERE / f"scenes_{name}.gif").is_file() == bool(picture.film)
         shown = f".. image:: ../../experiments/scenes/scenes_{name}.png\n   :alt: {picture.text}\n"
         assert shown in reference, name
 
 
 def test_pictures_are_small():
-    sizes = {path.name: path.stat().st_size for path in HERE.iterdir() if path.suffix in (".png", ".gif")}
+    sizes = {path.name: path.stat().st_size for path in HERE.iterdir() if path.suffix == ".png"}
     assert max(sizes.values()) <= 60_000
     assert sum(sizes.values()) <= 1_500_000

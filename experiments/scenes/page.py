@@ -30,9 +30,8 @@ and parameters are in [the reference](../../docs/api/scenes.rst). `python -m exp
 def entry(name: str) -> str:
     """Title, picture, sentence, links."""
     picture = PICTURES[name]
-    ending = "gif" if picture.film else "png"
     links = f"[Reference](../../docs/api/scenes.rst), [code](../../hhtjax/scenes/{name}.py)."
-    return f"## {name}\n\n![{picture.text}](scenes_{name}.{ending})\n\n{picture.text} {links}"
+    return f"## {name}\n\n![{picture.text}](scenes_{name}.png)\n\n{picture.text} {links}"
 
 
 def page() -> str:

@@ -1,11 +1,9 @@
-"""A picture of each scene of `hhtjax.scenes`, for the gallery and the reference; of some a film too."""
+"""A picture of each scene of `hhtjax.scenes`, for the gallery and the reference."""
 
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-import matplotlib.pyplot as plt
 import numpy as np
-from PIL import Image
 
 import hhtjax
 from experiments.report import COLOURS
@@ -20,8 +18,7 @@ class Picture(NamedTuple):
     """How a scene is shown: at some times, or, of what moves along a line, at one time above its course.
 
     scene: a function that makes it. text: what one sees, a sentence. times: s. course: {label: entry of q}, None
-    without. labels: {number of a shape, and of a point of it or None for its middle: text}, at the last time. film:
-    (frames per second, speed), None without.
+    without. labels: {number of a shape, and of a point of it or None for its middle: text}, at the last time.
     """
 
     scene: Any
@@ -29,7 +26,6 @@ class Picture(NamedTuple):
     times: tuple[float, ...]
     course: dict[str, Any] | None = None
     labels: dict[tuple[int, int | None], str] | None = None
-    film: tuple[float, float] | None = None
 
 
 MASS = {(0, None): "m", (1, None): "k"}
@@ -63,13 +59,13 @@ PICTURES = {
     "four_bars": Picture(
         scenes.four_bars.four_bars,
         "A row of two four-bar loops falls to its right; when all bars lie on one line, the loops could fold.",
-        (0.0, 0.4, 0.7),
+        (0.0, 0.3, 0.5),
     ),
     "slider_crank": Picture(
         scenes.slider_crank.driven,
         "A moment turns the crank, the rod pushes the slider, and a spring and a damper hold it back.",
-        (0.0, 0.2, 0.28),
-        labels={(0, 1): "crank, rod", (1, 2): "slider"},
+        (0.0, 0.15),
+        labels={(1, 2): "slider"},
     ),
     "flexible_slider_crank": Picture(
         scenes.flexible_slider_crank.flexible_slider_crank,
@@ -82,7 +78,6 @@ PICTURES = {
         "Seven bodies in three loops: a moment turns the small crank at the origin, and a spring pulls at one branch.",
         (0.0, 0.015),
         labels={(1, 0): "B", (2, 0): "A", (0, 2): "P", (4, -1): "C"},
-        film=(20, 0.004),
     ),
     "arm": Picture(
         scenes.arm.swing,
@@ -103,7 +98,7 @@ PICTURES = {
     "bouc_wen": Picture(
         scenes.bouc_wen.benchmark,
         "A mass on a spring with hysteresis, driven below its resonance.",
-        (0.025,),
+        (0.01,),
         ONE,
         DRIVEN,
     ),
@@ -117,7 +112,7 @@ PICTURES = {
     "maxwell": Picture(
         scenes.maxwell.vibration,
         "A mass on a rubber mount, a spring beside material that relaxes, driven near its resonance.",
-        (0.1,),
+        (0.29,),
         ONE,
         {(0, None): "m", (1, None): "rubber", (2, None): "k", (3, 1): "force"},
     ),
@@ -159,7 +154,6 @@ PICTURES = {
         "A body rides on a table that shakes, is thrown off, flies, and lands.",
         (0.3,),
         {"height (m)": 0},
-        film=(20, 0.4),
     ),
     "impact_oscillator": Picture(
         scenes.impact_oscillator.driven,
@@ -215,24 +209,10 @@ def draw(picture: Picture, scene, run):
         several = len(picture.course) > 1
         course.set(xlabel="t (s)", ylabel="q (m)" if several else next(iter(picture.course)))
         if several:
-            course.legend()
+            hhtjax.plot.legend(course)
     if not spatial:
         label(panel, picture, q, times[-1], scene)
     return figure
-
-
-def film(picture: Picture, scene, run, path):
-    """A GIF of few colours."""
-    fps, speed = picture.film or (20, 1)
-    found = hhtjax.plot.animation(run, scene, fps=fps, speed=speed)
-    found.save(path, dpi=80)
-    plt.close("all")
-    with Image.open(path) as image:
-        frames = []
-        for k in range(getattr(image, "n_frames", 1)):
-            image.seek(k)
-            frames.append(image.convert("RGB").quantize(16, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE))
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=1000 / fps, loop=0, optimize=True)
 
 
 def run(report, fast):
@@ -243,7 +223,3 @@ def run(report, fast):
         runs = pool.map(lambda scene: of(scene, 500 if fast else STEPS), made)
         for (name, picture), scene, found in zip(chosen.items(), made, runs, strict=True):
             report.figure(f"scenes_{name}", draw(picture, scene, found))
-            if picture.film and not fast:
-                path = report.out / f"scenes_{name}.gif"
-                film(picture, scene, found, path)
-                report.written.append(path)
