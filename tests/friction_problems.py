@@ -144,7 +144,7 @@ def body():
 
 
 def of_scene(scene):
-    return Case(*scene[:5])
+    return Case(*scene)
 
 
 CASES = {

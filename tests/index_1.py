@@ -30,7 +30,7 @@ UPRIGHT = 0.65  # s: the first singular position of the four bars comes after 0.
 
 def flat(scene):
     """M, Q and Phi as functions of vectors, M in full, and vectors q0 and v0."""
-    system, _, q0, v0, _ = scene[:5]
+    system, _, q0, v0, _ = scene
     vector, unravel = ravel_pytree(q0)
 
     def mass(q, params):

@@ -169,7 +169,7 @@ def test_power_balance():
 
 def end_of_run(scene, stepper):
     """The function num_steps -> state at the end, compiled once for all numbers of steps."""
-    system, params, q0, v0, duration = scene[:5]
+    system, params, q0, v0, duration = scene
 
     @jax.jit
     def run(num_steps):

@@ -83,7 +83,7 @@ def run(system=SLIDER, q0=None, stiffness=PARAMS["k"], stepper=HHT):
 def end(scene, alpha, num_steps, formulation, iterations):
     """State at the end, and the largest violations; alpha and num_steps traced, so that each form compiles once."""
     stepper = hhtjax.hht(alpha, formulation=formulation, iterations=iterations, tolerance=1e-12)
-    system, params, q0, v0, duration = scene[:5]
+    system, params, q0, v0, duration = scene
     dt = duration / num_steps
 
     def step(i, carry):

@@ -136,7 +136,7 @@ SCENES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_scenes_are_the_same_with_the_machinery_and_without(name):
-    system, params, q0, v0, duration, z0 = SCENES[name][:6]
+    system, params, q0, v0, duration, z0 = SCENES[name]
     n = 2000 if name == "LuGre" else 400
 
     @partial(jax.jit, static_argnums=0)
@@ -154,7 +154,7 @@ def test_scenes_are_the_same_with_the_machinery_and_without(name):
 @pytest.mark.slow
 def test_own_loop_and_sweep_equal_simulate():
     """Of a scene whose z0 differs between members."""
-    system, params, q0, v0, _, z0 = SCENES["motor"][:6]
+    system, params, q0, v0, _, z0 = SCENES["motor"]
     stepper, dt = hhtjax.hht(linearize="predictor"), 0.01
     z0 = jax.tree.map(lambda z: jnp.stack([z, z + 0.3]), z0)
     sweep = hhtjax.sweep(

@@ -129,7 +129,7 @@ def test_implicit_solvers_of_scipy_take_the_jacobian():
 
 @pytest.mark.slow
 def test_internal_states_go_along():
-    system, params, q0, v0, _, z0 = motor_joint.tracking()[:6]
+    system, params, q0, v0, _, z0 = motor_joint.tracking()
     rhs = interop.scipy_rhs(system, q0, v0, params, z0=z0)
     run = solve_ivp(rhs.fun, (0.0, 0.2), rhs.y0, "Radau", jac=rhs.jac, rtol=1e-8, atol=1e-10)
     ours = hhtjax.simulate(

@@ -26,7 +26,7 @@ FINEST = 1e-4
 @cache
 def reference(scene):
     """The path at intervals of FINEST, by the fourth-order Runge-Kutta method with a quarter of that."""
-    system, params, q0, v0, duration = SCENES[scene][:5]
+    system, params, q0, v0, duration = SCENES[scene]
     num_steps = 4 * round(duration / FINEST)
     run = hhtjax.simulate(system, hhtjax.rk4(), q0, v0, params, dt=FINEST / 4, num_steps=num_steps, save_every=4)
     run.check()
@@ -36,7 +36,7 @@ def reference(scene):
 @jax.jit
 def mean_squares(scene, stepper, num_steps, exact, stride):
     """Of the errors over all steps, the start counted; and whether all converged. Compiled once for all num_steps."""
-    system, params, q0, v0, duration = scene[:5]
+    system, params, q0, v0, duration = scene
     dt = duration / num_steps
 
     def step(i, carry):

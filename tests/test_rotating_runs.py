@@ -85,7 +85,7 @@ def test_gradients():
 @pytest.mark.every
 def test_gradient_without_a_constraint():
     """Forward along one direction in all params, v0 and dt = reverse = central; from rest too."""
-    system, params, q0, v0, _ = top.minimal(spin=5.0)[:5]
+    system, params, q0, v0, _ = top.minimal(spin=5.0)
     direction = jnp.array([0.6, 0.8, 0.5])
 
     def loss(x):

@@ -72,7 +72,7 @@ PROBLEMS = {
 }
 
 # set-valued forces: for the hht family alone, with references of their own (friction_reference.py)
-DRY = {"two masses on a belt": Problem(*belt.two_masses()[:5])}
+DRY = {"two masses on a belt": Problem(*belt.two_masses())}
 
 STEPPERS = {
     "hht auto": hhtjax.hht(alpha=-0.05),

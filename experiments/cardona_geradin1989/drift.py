@@ -26,7 +26,7 @@ FAST_METHODS, FAST_STEPS = tuple(METHODS)[2:], 5000
 
 def largest_violations(scene, stepper, h, num_steps):
     """Of Phi and dPhi/dt, (WINDOWS,) each: the largest in each window, or, for an ODE, those at the ends of windows."""
-    system, params, q0, v0, _ = scene[:5]
+    system, params, q0, v0, _ = scene
     every = num_steps // WINDOWS
     if stepper.solves_constraints:
         info = simulate(system, stepper, q0, v0, params, dt=h, num_steps=num_steps, save_every=every).info

@@ -29,7 +29,7 @@ def energies(scene, q, v):
 
 def assess(scene, formulation, solve, h):
     """One run."""
-    system, params, q0, v0, duration = scene[:5]
+    system, params, q0, v0, duration = scene
     stepper = hht(ALPHA, formulation=formulation, redundant=SOLVES[solve])
     path = simulate(system, stepper, q0, v0, params, dt=h, num_steps=round(duration / h))
     path.check()

@@ -32,7 +32,7 @@ FRAMES, SMOKE_FRAMES = 75, 5  # of the animation
 
 def run_method(name):
     """q, v, w and L of a run; unchecked, because the trapezoidal rule fails in the end."""
-    system, params, q0, v0, _ = squeezer.squeezer()[:5]
+    system, params, q0, v0, _ = squeezer.squeezer()
     h, num_steps = DURATION / NUM_STEPS, CARRIED_ON * NUM_STEPS
     path = simulate(system, METHODS[name], q0, v0, params, dt=h, num_steps=num_steps)
     return [np.asarray(x) for x in (path.q, path.v, path.acceleration, path.multipliers)]

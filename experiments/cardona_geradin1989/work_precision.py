@@ -107,7 +107,7 @@ def dae_entries(scene, exact, names, tolerances):
     """Of scipy-dae on the GGL system, q' = v + B^T mu; L and mu are the rates of the last unknowns."""
     from scipy_dae.integrate import solve_dae  # pyright: ignore[reportMissingImports]  # of an extra of its own
 
-    system, params, q0, v0, duration = scene[:5]
+    system, params, q0, v0, duration = scene
     w0, L0 = accelerations(system, q0, v0, jnp.zeros(()), params)
     n, m = q0.size, L0.size
 

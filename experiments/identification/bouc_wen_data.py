@@ -114,7 +114,7 @@ def reconstruct(u, period, substeps):
 
 def simulate(params, u, samples, substeps, alpha: Any = 0.0):
     """Displacement at `samples` samples from rest on, in m, by the non-iterative step."""
-    system, given, q0, v0, _, z0 = bouc_wen.measured(params, u, None)[:6]
+    system, given, q0, v0, _, z0 = bouc_wen.measured(params, u, None)
     run = hhtjax.simulate(
         system,
         hhtjax.hht(alpha, linearize="predictor"),  # smooth in the parameters

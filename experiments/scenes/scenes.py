@@ -25,7 +25,7 @@ class Picture(NamedTuple):
     text: str
     times: tuple[float, ...]
     course: dict[str, Any] | None = None
-    labels: dict[tuple[int, int | None], str] | None = None
+    labels: dict[Any, str] | None = None
 
 
 MASS = {(0, None): "m", (1, None): "k"}
@@ -167,7 +167,7 @@ PICTURES = {
 
 def of(scene, num_steps: int = STEPS):
     """Its run, with the default stepper."""
-    more = {"events": scene.events} if isinstance(scene, scenes.EventScene) else {}
+    more: dict[str, Any] = {"events": scene.events} if isinstance(scene, scenes.EventScene) else {}
     more |= {"z0": scene.z0} if isinstance(scene, scenes.InternalScene) else {}
     start = scene.q0, scene.v0, scene.params
     dt = scene.duration / num_steps

@@ -68,7 +68,7 @@ class Cell(NamedTuple):
 @partial(jax.jit, static_argnames=("method", "verify"))
 def controlled(scene, alpha, method, verify):
     """A run under error control, read off at the sample times."""
-    system, params, q0, v0, duration = scene[:5]
+    system, params, q0, v0, duration = scene
     times = duration * jnp.arange(1, SAMPLES + 1) / SAMPLES
     control = hhtjax.adaptive(RTOL, ATOL, verify=verify, max_steps=TRIES.get(verify, 10_000))
     return hhtjax.simulate(system, CONTROLLED[method].make(alpha), q0, v0, params, dt=control, times=times)

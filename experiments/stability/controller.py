@@ -51,7 +51,7 @@ class Outcome(NamedTuple):
 @partial(jax.jit, static_argnames="method")
 def controlled(scene, rtol, controller, method):
     """Steps, error of the run by halved steps over what is asked for, and q."""
-    system, params, q0, v0, duration = scene[:5]
+    system, params, q0, v0, duration = scene
     times = duration * jnp.arange(1, SAMPLES + 1) / SAMPLES
     problem = Problem.checked("controller", system, METHODS[method], q0, v0, params, 0.0, None)
     control = hhtjax.adaptive(rtol, ATOL * rtol, max_steps=MAX_STEPS)

@@ -126,7 +126,7 @@ def dampers():
 
 def rods(duration):
     """By method: times, and the relative error of the rod's length."""
-    system, params, q0, v0, _ = pendulum.cartesian()[:5]
+    system, params, q0, v0, _ = pendulum.cartesian()
     rhs = hhtjax.interop.scipy_rhs(system, q0, v0, params)
     times = np.linspace(0.0, duration, 101)
     found = {}

@@ -30,7 +30,7 @@ def run_again(scene, counts, alphas, method, num_steps):
     """A batch of runs with steps of duration/count."""
 
     def single(count, alpha):
-        system, params, q0, v0, duration = scene[:5]
+        system, params, q0, v0, duration = scene
         stepper = METHODS[method].make(alpha)
         return hhtjax.simulate(system, stepper, q0, v0, params, dt=duration / count, num_steps=num_steps)
 

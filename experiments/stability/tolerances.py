@@ -115,7 +115,7 @@ def reference(scene):
 @partial(jax.jit, static_argnames=("method", "verify"))
 def controlled(scene, rtol, method, verify=False):
     """A run under error control."""
-    system, params, q0, v0, duration = scene[:5]
+    system, params, q0, v0, duration = scene
     times = duration * jnp.arange(1, SAMPLES + 1) / SAMPLES
     control = hhtjax.adaptive(rtol, ATOL * rtol, max_steps=MAX_STEPS, verify=verify)
     return hhtjax.simulate(system, METHODS[method], q0, v0, params, dt=control, times=times)

@@ -43,7 +43,7 @@ def swept(members, devices):
     from hhtjax import trigonometry
     from hhtjax.scenes import double_pendulum
 
-    system, params, q0, v0, _ = double_pendulum.free(trigonometry)[:5]
+    system, params, q0, v0, _ = double_pendulum.free(trigonometry)
     q0, v0 = np.asarray(q0), np.asarray(v0)
     mesh = None if devices == 1 else jax.make_mesh((jax.device_count(),), ("members",))
     dts = np.random.default_rng(0).uniform(1e-3, 1e-2, members)

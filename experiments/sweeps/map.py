@@ -39,7 +39,7 @@ def members(fast):
 
 def inputs(scene, scale, alpha, h):
     """The sweep, not run yet."""
-    system, params, q0, v0, _ = scene[:5]
+    system, params, q0, v0, _ = scene
     k = tuple(x * scale for x in params["k"])
     stepper = jax.vmap(lambda alpha: hhtjax.hht(alpha, linearize="predictor"))(jnp.asarray(alpha))
     axes = (0, None, None, {**dict.fromkeys(params), "k": 0})
@@ -50,7 +50,7 @@ def inputs(scene, scale, alpha, h):
 
 def references(scene, scales, fast):
     """Angles at the end for each scale."""
-    system, params, q0, v0, _ = scene[:5]
+    system, params, q0, v0, _ = scene
     k = tuple(x * scales for x in params["k"])
     runs = hhtjax.sweep(
         system, hhtjax.rowda(), q0, v0, {**params, "k": k}, dts=np.full(len(scales), 1e-3 if fast else 2e-5),

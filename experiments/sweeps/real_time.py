@@ -41,7 +41,7 @@ def scenes():
 
 def step_of(scene, h, stepper=STEPPER):
     """A function (state, command) -> state of vectors, and the first state; the command adds to Q."""
-    system, params, q0, v0, _ = scene[:5]
+    system, params, q0, v0, _ = scene
 
     def driven(q, v, t, params):
         params, command = params

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,64 +14,92 @@ from hhtjax.systems.events import Event
 from hhtjax.systems.system import LinearSystem, System
 
 
-@shown
-class Scene(NamedTuple):
-    """A system, and what a run needs besides a stepper and a step size.
+class _Drawn(tuple):
+    """A named tuple that knows how it is drawn. The drawing is no entry: it is not unpacked, and no leaf of a pytree."""
 
-    Attributes:
-        system, params: what moves.
-        q0, v0: initial position and velocity.
-        duration: s.
-        drawing: a `hhtjax.scenes.drawings.Drawing`, what `hhtjax.plot.animation` draws; or None.
-    """
+    drawing: Drawing | None = None
 
+    @classmethod
+    def _with(cls, drawing: Drawing | None, entries: tuple) -> Self:
+        scene = tuple.__new__(cls, entries)
+        scene.drawing = drawing
+        return scene
+
+    def _replace(self, /, **changes: Any) -> Self:
+        """The scene with other entries."""
+        return self._with(self.drawing, super()._replace(**changes))  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class _Scene(NamedTuple):
     system: System | LinearSystem
     params: PyTree
     q0: PyTree
     v0: PyTree
     duration: float
-    drawing: Drawing | None = None
 
 
-@shown
-class EventScene(NamedTuple):
-    """A system with events, and what a run needs besides a stepper and a step size.
-
-    Attributes:
-        system, params: what moves.
-        q0, v0: initial position and velocity.
-        duration: s.
-        events: what happens on the way, a tuple of `Event`.
-        drawing: a `hhtjax.scenes.drawings.Drawing`, what `hhtjax.plot.animation` draws; or None.
-    """
-
+class _EventScene(NamedTuple):
     system: System | LinearSystem
     params: PyTree
     q0: PyTree
     v0: PyTree
     duration: float
     events: tuple[Event, ...]
-    drawing: Drawing | None = None
 
 
-@shown
-class InternalScene(NamedTuple):
-    """A system with internal states, and what a run needs besides a stepper and a step size.
-
-    Attributes:
-        system, params: what moves.
-        q0, v0, z0: initial position, velocity and internal states.
-        duration: s.
-        drawing: a `hhtjax.scenes.drawings.Drawing`, what `hhtjax.plot.animation` draws; or None.
-    """
-
+class _InternalScene(NamedTuple):
     system: System
     params: PyTree
     q0: PyTree
     v0: PyTree
     duration: float
     z0: PyTree
-    drawing: Drawing | None = None
+
+
+@shown
+class Scene(_Drawn, _Scene):
+    """A system, and what a run needs besides a stepper and a step size: `system, params, q0, v0, duration = scene`.
+
+    Attributes:
+        system, params: the system and its parameters.
+        q0, v0: initial position and velocity.
+        duration: s.
+        drawing: a `hhtjax.scenes.drawings.Drawing` for `hhtjax.plot.animation`, or None. It is not unpacked.
+    """
+
+    def __new__(cls, system, params, q0, v0, duration, drawing=None):
+        return cls._with(drawing, (system, params, q0, v0, duration))
+
+
+@shown
+class EventScene(_Drawn, _EventScene):
+    """A system with events, and what a run needs besides a stepper and a step size.
+
+    Attributes:
+        system, params: the system and its parameters.
+        q0, v0: initial position and velocity.
+        duration: s.
+        events: events of the run, a tuple of `Event`.
+        drawing: a `hhtjax.scenes.drawings.Drawing` for `hhtjax.plot.animation`, or None. It is not unpacked.
+    """
+
+    def __new__(cls, system, params, q0, v0, duration, events, drawing=None):
+        return cls._with(drawing, (system, params, q0, v0, duration, events))
+
+
+@shown
+class InternalScene(_Drawn, _InternalScene):
+    """A system with internal states, and what a run needs besides a stepper and a step size.
+
+    Attributes:
+        system, params: the system and its parameters.
+        q0, v0, z0: initial position, velocity and internal states.
+        duration: s.
+        drawing: a `hhtjax.scenes.drawings.Drawing` for `hhtjax.plot.animation`, or None. It is not unpacked.
+    """
+
+    def __new__(cls, system, params, q0, v0, duration, z0, drawing=None):
+        return cls._with(drawing, (system, params, q0, v0, duration, z0))
 
 
 def array(values: PyTree) -> Array:
