@@ -121,10 +121,9 @@ def require_params(caller: str, params: PyTree):
             _require_hashable(where, leaf)
         elif not data:
             shown = f"an array of {leaf.dtype}" if isinstance(leaf, np.ndarray) else repr(leaf)
-            raise TypeError(
-                f"{where} must be an array, a number or a function; received {shown}. Put other values "
-                "into the functions of the system."
-            )
+            other = "Put other values into the functions of the system."
+            hint = "Write `x.to_numpy()` for a column of pandas." if hasattr(leaf, "to_numpy") else other
+            raise TypeError(f"{where} must be an array, a number or a function; received {shown}. {hint}")
     return freeze(params)
 
 

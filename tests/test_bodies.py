@@ -225,10 +225,12 @@ def test_couplings_hold_and_weld():
     np.testing.assert_allclose(end["held"].x, end["driver"].x + end["driver"].R @ jnp.array([0.5, 0, 0]), atol=1e-11)
 
 
-def test_a_weld_half_a_turn_off_is_refused():
-    """Its rows vanish there, too."""
+def test_a_weld_half_a_turn_off_is_refused_and_one_far_off_is_told_of():
+    """Half a turn off the rows of a weld vanish, too."""
     free = {"joints": Joint("free"), "mass": 1.0, "inertia": (0.1, 0.1, 0.1)}
-    tree([Body("b", rotation=(np.cos(0.5), np.sin(0.5), 0, 0), **free)], loops=[Weld("world", "b")])
+    with pytest.warns(UserWarning, match=r"open by 0.84 m or rad.* moved by up to 0.84 .* check `anchor1`") as told:
+        tree([Body("b", rotation=(np.cos(0.5), np.sin(0.5), 0, 0), **free)], loops=[Weld("world", "b")])
+    assert told[0].filename == __file__
     with pytest.raises(ValueError, match="error of half a turn"):
         tree([Body("b", rotation=(0.05, 1.0, 0, 0), **free)], loops=[Weld("world", "b")])
 

@@ -15,7 +15,11 @@ from hhtjax import LinearSystem, System, interpolate
 
 NOT_A_MATRIX = [
     (TypeError, "must be a function or an array; received 'steel'", "steel"),
-    (TypeError, "must be a function or an array; received {'a': 1}", {"a": 1}),
+    (
+        TypeError,
+        "must be a function or an array; received {'a': 1}. Its rows and columns follow the sorted keys of q.",
+        {"a": 1},
+    ),
     (TypeError, "must be a function or an array; received [[1, 2], [3]]", [[1, 2], [3]]),
     (TypeError, "must be real; received an array of complex128", COMPLEX),
     (TypeError, "must be real; received an array of bool", np.array([True])),
@@ -218,6 +222,13 @@ INITIAL_VALUES = [
     (ValueError, "`v0` must have the shapes of q0, shape (1,) float64; received shape () float64.", ONE, 0.0),
     (
         ValueError,
+        "`v0` must have the shapes of q0, shape (1,) float64; received shape (1, 1) float64. Is q0 short of an axis? "
+        "For one coordinate write q0[:, None].",
+        ONE,
+        np.ones((1, 1)),
+    ),
+    (
+        ValueError,
         "`v0` must have the shapes of q0, ['a']: shape (1,) float64; received ['a']: shape (2,) float64.",
         {"a": ONE},
         {"a": np.ones(2)},
@@ -283,6 +294,9 @@ def test_interpolate_takes_the_ends_up_to_rounding_and_gives_nan_for_tracers_out
     solution = run(t0=2.0)
     ends = np.array([2.0 - 4e-16, 2.4 + 9e-16])
     assert np.allclose(interpolate(solution, ends).q, np.asarray(solution.q)[[0, -1]], rtol=1e-14)
+    printed = 3e-7  # beyond the end, as times of six digits may be
+    beyond = np.asarray(solution.q[-1] + printed * solution.v[-1])
+    assert np.allclose(interpolate(solution, 2.4 + printed).q, beyond, rtol=1e-11)
     q = jax.jit(lambda times: interpolate(solution, times).q)(np.array([1.9, 2.1, 2.5]))
     assert np.isnan(q[:, 0]).tolist() == [True, False, True]
 

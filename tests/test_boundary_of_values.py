@@ -179,13 +179,24 @@ class Unhashable:
 
 
 WORDS = "an array, a number or a function"
-ENDS = {"Unhashable()": "Make it a pytree"}
+ENDS = {"Unhashable()": "Make it a pytree", "Column()": "Write `x.to_numpy()`"}
+
+
+class Column:
+    """Like a column of pandas."""
+
+    def to_numpy(self):
+        return np.ones(2)
+
+    def __repr__(self):
+        return "Column()"
 
 
 @pytest.mark.parametrize(
     ("value", "received", "what"),
     [
         *((*x, WORDS) for x in NO_DATA),
+        (Column(), "Column()", WORDS),
         (Unhashable(), "Unhashable()", "hashable, because a function is static under jit"),
     ],
 )

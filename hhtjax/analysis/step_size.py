@@ -123,8 +123,10 @@ def suggest_step_size(
 
     With `duration`, it makes runs with 8, 16, 32, ... steps, until the RMS error of q over [t0, t0 + duration] stays
     within the tolerance. The error is relative to the RMS of q about its mean. The suggested step is the largest with
-    such an error. This takes about eight times as long as the suggested run, and at least 2000 steps. It is misled if
-    all runs have the same error, for example if the method damps a fast vibration out of all of them.
+    such an error. It is one of all entries of q together: small differences of large entries, such as storey drifts
+    above soft isolators, may be far less accurate. This takes about eight times as long as the suggested run, and at
+    least 2000 steps. It is misled if all runs have the same error, for example if the method damps a fast vibration out
+    of all of them.
 
     Args:
         system, stepper, q0, v0, params, z0, t0: as in `simulate`; no `FirstOrderSystem`. Modes change along a motion,
@@ -187,6 +189,8 @@ def suggest_step_size(
         with stages(caller, progress) as tell:
             dt, most = step_size_by_runs(*given, tell)
         reason = f"keeps q within {tolerance:g} of its motion over {duration:g} s, by runs of up to {most} steps"
+        if coarse := sum(dt > largest for largest in resolved):
+            reason += f"; {coarse} of {len(resolved)} modes have larger errors than that"
 
     modes = []
     for rate, largest in zip(rates, resolved, strict=True):

@@ -104,6 +104,7 @@ from hhtjax.bodies.functions import (
     inertial_parameters,
     inverse_dynamics,
     mass_matrix,
+    motor_forces,
     regressor,
 )
 from hhtjax.bodies.mechanism import Mechanism, tree
@@ -128,6 +129,7 @@ __all__ = [
     "inverse_dynamics",
     "load",
     "mass_matrix",
+    "motor_forces",
     "regressor",
     "tree",
 ]

@@ -314,7 +314,15 @@ def inputs(model: Model, dtype: np.dtype, t: Real, params: PyTree) -> Array:
 
 
 def driven(model: Model, x: Array, rate: Array, z: Array | None, t: Real, params: PyTree) -> Array:
-    """gear F of each motor, on hinges and slides: (ns,)."""
+    """The forces of all motors on hinges and slides: (ns,)."""
+    F, slots = of_motors(model, x, rate, z, t, params), np.array([drive.slot for drive in model.drives])
+    if slots.tolist() == list(range(len(x))):  # one on each
+        return F
+    return total(slots[None, :] == np.arange(len(x))[:, None], F[:, None])[:, 0]
+
+
+def of_motors(model: Model, x: Array, rate: Array, z: Array | None, t: Real, params: PyTree) -> Array:
+    """gear F of each motor: (na,)."""
     u = inputs(model, x.dtype, t, params)
     if z is not None:
         numbers = np.array(model.activated)
@@ -327,8 +335,7 @@ def driven(model: Model, x: Array, rate: Array, z: Array | None, t: Real, params
     known = {name: (kinds == name).astype(x.dtype) for name in ("torque", "position", "velocity")}
     F = params["kp"] * (known["position"] * u - s) + params["kv"] * (known["velocity"] * u - sdot) + params["offset"]
     F = F + known["torque"] * params["gain"] * u
-    F = gear * _clipped(F, [drive.forcerange for drive in model.drives])
-    return F if one_each else total(slots[None, :] == np.arange(len(x))[:, None], F[:, None])[:, 0]
+    return gear * _clipped(F, [drive.forcerange for drive in model.drives])
 
 
 def _clipped(x: Array, ranges: list) -> Array:

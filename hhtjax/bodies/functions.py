@@ -13,6 +13,7 @@ from hhtjax.bodies.equations import (
     as_rates,
     inertia_of,
     of_links,
+    of_motors,
     offsets_of,
     position,
     rates,
@@ -119,6 +120,34 @@ def forces(
     require_activations(model, z)
     p = position(model.tree, q)
     return as_rates(model.tree, applied_forces(model, q, p, rates(model.tree, v), z, t, params))
+
+
+def motor_forces(
+    robot: Mechanism, q: PyTree, v: PyTree, t: Real = 0.0, params: PyTree = None, z: Array | None = None
+) -> Array:
+    """The torque, N m, or force, N, of each motor on its joint: gear F, with F of `Motor`, within its `forcerange`.
+
+    Along a run: `jax.vmap(lambda q, v, t: motor_forces(robot, q, v, t, params))(run.q, run.v, run.t)`.
+
+    Args: robot: a `Mechanism`. q, v: as in its system. t: s. params: with "ctrl"; None for `robot.params`.
+    z: activations, None for z0.
+    Returns: (na,), in the order of `Mechanism.motors`.
+    Raises: KeyError: params without an entry. TypeError, ValueError: not a mechanism; an array of another shape.
+
+    >>> from hhtjax.bodies import Body, Joint, Motor, motor_forces, tree
+    >>> rod = Body("rod", joints=Joint(axis=[0, 1, 0]), mass=3.0, com=[0.5, 0, 0])
+    >>> robot = tree([rod], motors=[Motor("rod", "position", kp=100.0, kv=5.0)])
+    >>> params = robot.params | {"ctrl": jnp.array([0.3])}
+    >>> motor_forces(robot, jnp.array([0.2]), jnp.ones(1), params=params).round(3).tolist()
+    [5.0]
+    """
+    model, params = _known("motor_forces", robot, params, q, v=v)
+    z = robot.z0 if z is None else z
+    require_activations(model, z)
+    if not model.drives:
+        return jnp.zeros(0, params["mass"].dtype)
+    rate = rates(model.tree, v)
+    return of_motors(model, position(model.tree, q).x, rate[model.tree.rates - model.tree.scalars :], z, t, params)
 
 
 def regressor(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: PyTree = None) -> Array:

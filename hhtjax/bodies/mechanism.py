@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -42,6 +43,7 @@ GRAVITY = (0.0, 0.0, -9.80665)
 INDEPENDENT = 1e-6  # sine of the angle to the rows before, below which a row of a loop says nothing new
 STOP_TIME = 0.005  # s, half a period of what hits a stiff stop
 RESTITUTION = 0.3
+FAR = 0.5  # rad or m; joints that are moved farther to close loops deserve a warning
 SINGULAR = 1e-12  # eigenvalue of the mass matrix, its diagonal scaled to 1, that is rounding
 
 
@@ -521,7 +523,16 @@ def _closed(caller: str, model: Model, q0: PyTree, v0: PyTree, params: dict):
         return bool(np.any(np.asarray(welded(q)) < 1)) if any(row.kind == "weld" for row in model.loops) else False
 
     with plain():  # small programs, compiled once
+        drawn = q
         q, B = _onto_loops(caller, q, linearized, move, turned_over)
+        if (moved := float(jnp.max(jnp.abs(q - drawn)))) > FAR:
+            gap = float(jnp.max(jnp.abs(linearized(drawn)[0])))
+            warnings.warn(
+                f"{caller}: the described bodies leave the loops open by {gap:.2g} m or rad. To close them, joints "
+                f"were moved by up to {moved:.2g} rad or m. If that is not intended, check `anchor1` and `anchor2`, "
+                "and describe a position that is nearer.",
+                stacklevel=4,
+            )
         near = [B]
         for seed in (1, 2):  # at a special position more rows may depend on each other than elsewhere
             x = np.random.default_rng(seed).normal(size=B.shape[1])

@@ -130,6 +130,9 @@ def fit(
     their standard errors. `result.choices` is the number of repetitions. If the error control leaves errors larger than
     the noise, the fit ends with "the estimates change whenever steps are chosen anew".
 
+    The step size: residuals of a simulation contain its error, and the estimates follow. Standard errors do not include
+    this bias. Fit again with half the step, or use `refine`; `step_size_bias` predicts it.
+
     Returns:
         A `FitResult`. Outside jit and vmap, problems raise an error or a warning. Inside them, check `result.code`.
 

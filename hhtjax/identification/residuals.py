@@ -34,7 +34,8 @@ def check_residuals(caller: str, residuals: Callable | Reading, p: int, *args: P
     except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
         raise TypeError(
             f"{caller}: `residuals` must be traceable by JAX: use jax.numpy instead of NumPy, float() and `if` for all "
-            f"that depends on params; received {residuals!r}, whose error stands above."
+            "that depends on params, and arrays instead of columns of pandas (`x.to_numpy()`); received "
+            f"{residuals!r}, whose error stands above."
         ) from error
     leaves = jax.tree.leaves(shapes)
     for leaf in leaves:

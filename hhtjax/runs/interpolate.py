@@ -20,6 +20,8 @@ from hhtjax.steppers.taylor import Expansion, summed
 from hhtjax.systems import kinematics, zero_order_hold
 from hhtjax.xla import Programs
 
+PRINTED = 1e-6  # times that were written to six digits may lie outside of a run by this part of it
+
 if TYPE_CHECKING:
     from hhtjax.runs.output import Output
     from hhtjax.runs.solution import Failure
@@ -111,7 +113,7 @@ def interpolate(solution: Solution, times: Real | None) -> Interpolant:
     found, outside = _found(known, jnp.asarray(times), equal=equal)
     if is_concrete(outside) and np.any(outside):
         bad = np.asarray(times).astype(t.dtype)[np.asarray(outside)].flat[0]
-        raise ValueError(f"interpolate: `times` must lie in [{t[0]:.6g}, {t[-1]:.6g}]; received {bad:.6g}.")
+        raise ValueError(f"interpolate: `times` must lie in [{t[0]:.9g}, {t[-1]:.9g}]; received {bad:.9g}.")
     v = None if solution.acceleration is None else found.v
     return Interpolant(found.q, v, *(getattr(found, name) for name in Interpolant._fields[2:]))
 
@@ -131,7 +133,8 @@ def _found(known: Solution, times: Array, equal: bool | None):
     if this is known only at run time."""
     t, times = known.t, times.astype(known.t.dtype)
     start, end = t[0], t[-1]
-    slack = 16 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(start), jnp.abs(end))
+    rounding = 16 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(start), jnp.abs(end))
+    slack = jnp.maximum(rounding, PRINTED * (end - start))
     outside = ~((times >= start - slack) & (times <= end + slack))
 
     def of_equal():

@@ -15,7 +15,7 @@ from hhtjax.systems.system import LinearSystem, System
 
 
 class _Drawn(tuple):
-    """A named tuple that knows how it is drawn. The drawing is no entry: it is not unpacked, and no leaf of a pytree."""
+    """A named tuple that knows how it is drawn. The drawing is no entry: not unpacked, and no leaf of a pytree."""
 
     drawing: Drawing | None = None
 

@@ -295,8 +295,9 @@ def initial_values(caller: str, system, q0: PyTree, v0: PyTree, z0: PyTree = Non
         elif a != b:
             turns = a[-2:] == (3, 3) or (a[-1:], b[-1:]) == ((4,), (3,))  # or is a quaternion
             rotation = ", but (3,) for a rotation, a matrix (3, 3)" if turns else ""
+            column = " Is q0 short of an axis? For one coordinate write q0[:, None]." if a == b[:-1] else ""
             raise ValueError(
-                f"{caller}: `v0` must have the shapes of q0, {describe(q0)}{rotation}; received {describe(v0)}."
+                f"{caller}: `v0` must have the shapes of q0, {describe(q0)}{rotation}; received {describe(v0)}.{column}"
             )
     dtype = _the_one(caller, dtypes, q0, v0, z0) if dtypes else jnp.result_type(float)
     if dtype == jnp.float32:

@@ -93,7 +93,8 @@ def constant_matrix(caller: str, name: str, received: PyTree, keep: bool = False
     if not is_real(value):
         if is_array(received) or (isinstance(received, (list, tuple)) and value.ndim):
             raise TypeError(f"{caller}: `{name}` must be real; received an array of {value.dtype}.")
-        raise TypeError(f"{caller}: `{name}` must be a function or an array; received {received!r}.")
+        order = " Its rows and columns follow the sorted keys of q." if isinstance(received, dict) else ""
+        raise TypeError(f"{caller}: `{name}` must be a function or an array; received {received!r}.{order}")
     if not is_array(received):
         value = value.astype(float)
     if value.ndim == 0:
