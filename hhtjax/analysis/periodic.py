@@ -55,7 +55,8 @@ class PeriodicSolution(NamedTuple):
     @property
     def multipliers(self) -> np.ndarray:
         """Floquet multipliers (N,), the eigenvalues of `monodromy`, largest modulus first: a small disturbance grows by
-        these factors in each period. NumPy; under jit use `monodromy`."""
+        these factors in each period. Values below 1e-14 times the norm of `monodromy` are rounding. NumPy; under jit
+        use `monodromy`."""
         found = np.linalg.eigvals(np.asarray(self.monodromy))
         return np.take_along_axis(found, np.argsort(-np.abs(found), axis=-1, kind="stable"), axis=-1)
 
@@ -122,9 +123,9 @@ def periodic_solution(
             time.
 
     Returns:
-        A `PeriodicSolution`. All its arrays have derivatives in params, period, forward and reverse, where the motion
-        is isolated: by the implicit function, without those of the iterations. Without damping a free vibration is one
-        of a family, and its derivatives mean nothing. Under jit nothing raises, and `converged` tells.
+        A `PeriodicSolution`: q, v, period, `orbit` (one period, a `Solution`), `monodromy`, `multipliers`, `stable`. If the motion is isolated, its arrays have derivatives with respect to params and period, forward and reverse,
+        by the implicit function theorem. An undamped free vibration is one of a family; its derivatives mean nothing.
+        Under jit nothing raises: look at `converged`.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; no periodic motion was found.

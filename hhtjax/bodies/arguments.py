@@ -56,7 +56,9 @@ def require_params(model: Model, params: PyTree):
         elif name not in OTHERS:
             near = get_close_matches(str(name), [*known, *OTHERS], 1, SIMILAR)
             if near:
-                raise ValueError(f'params["{name}"] is not read; did you mean "{near[0]}"?')
+                raise ValueError(
+                    f'params["{name}"] is not read; did you mean "{near[0]}"? Parameters of your own need other names.'
+                )
 
 
 OTHERS = "torque", "wrench", "restitution"  # which are looked at where they are read

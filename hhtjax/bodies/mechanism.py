@@ -531,7 +531,7 @@ def _closed(caller: str, model: Model, q0: PyTree, v0: PyTree, params: dict):
                 f"{caller}: the described bodies leave the loops open by {gap:.2g} m or rad. To close them, joints "
                 f"were moved by up to {moved:.2g} rad or m. If that is not intended, check `anchor1` and `anchor2`, "
                 "and describe a position that is nearer.",
-                stacklevel=4,
+                stacklevel=5,
             )
         near = [B]
         for seed in (1, 2):  # at a special position more rows may depend on each other than elsewhere
