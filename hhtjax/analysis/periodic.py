@@ -123,7 +123,8 @@ def periodic_solution(
             time.
 
     Returns:
-        A `PeriodicSolution`: q, v, period, `orbit` (one period, a `Solution`), `monodromy`, `multipliers`, `stable`. If the motion is isolated, its arrays have derivatives with respect to params and period, forward and reverse,
+        A `PeriodicSolution`: q, v, period, `orbit` (one period, a `Solution`), `monodromy`, `multipliers`, `stable`.
+        If the motion is isolated, its arrays have derivatives with respect to params and period, forward and reverse,
         by the implicit function theorem. An undamped free vibration is one of a family; its derivatives mean nothing.
         Under jit nothing raises: look at `converged`.
 
