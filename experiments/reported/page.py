@@ -32,12 +32,13 @@ def page(numbers):
     ]
     order = [[name, *(f"{x:.2f}" for x in by_mass.values())] for name, by_mass in numbers["order"].items()]
     masses = list(next(iter(numbers["order"].values())))
+    errors_before = [x for kind in kinds for x in light_errors(before["starts"], kind) if x is not None]
     return (
         (HERE / "page.md")
         .read_text()
         .format(
             problems=len(rows),
-            worst_before=f"{max(x for kind in kinds for x in light_errors(before['starts'], kind)):.0e} F/k",
+            worst_before=f"{max(errors_before):.0e} F/k",
             worst_now=f"{max(x for by_name in numbers['worst_error'].values() for x in by_name.values()):.0e} F/k",
             cases=table(["problem", "right answer", "before", "now"], rows),
             worst=table(["before -> now", *kinds], worst),
