@@ -92,6 +92,6 @@ def test_a_film_is_one_call(tmp_path):
 
 
 def test_a_scene_without_a_drawing_is_named():
-    scene = double_pendulum.free()._replace(drawing=None)
+    scene = Scene(*double_pendulum.free())
     with pytest.raises(ValueError, match="animation: `points` is a Scene without a `drawing`"):
         film_of(scene, lambda q, t: q)

@@ -129,8 +129,8 @@ def motor_forces(
 
     Along a run: `jax.vmap(lambda q, v, t: motor_forces(robot, q, v, t, params))(run.q, run.v, run.t)`.
 
-    Args: robot: a `Mechanism`. q, v: as in its system. t: s. params: with "ctrl"; None for `robot.params`.
-    z: activations, None for z0.
+    Args: robot: a `Mechanism`. q, v: as in its system. t: s. params: None for `robot.params`. z: activations, None for
+    z0.
     Returns: (na,), in the order of `Mechanism.motors`.
     Raises: KeyError: params without an entry. TypeError, ValueError: not a mechanism; an array of another shape.
 

@@ -207,8 +207,7 @@ def require_consistent(
     z0: PyTree = None,
     checked: tuple = CHECKED,
 ):
-    """Raises an error if q0 or v0 violates the constraints by more than rounding, or if these are dependent; tracers
-    pass.
+    """Raises an error if q0 or v0 violates the constraints beyond rounding, or these are dependent; tracers pass.
 
     checked: the names of the caller's arguments for q0, and for v0 if it is to be checked, and what they violate.
     """

@@ -252,7 +252,7 @@ def columns(solution: Any) -> dict[str, np.ndarray]:
     return _columns("columns", solution)
 
 
-def write_csv(path: str | PathLike, solution: Any):
+def write_csv(path: str | PathLike, solution: Any) -> None:
     """A run as a file of comma-separated values: the names of `columns` in the first line, then a line for each time.
 
     Numbers have the digits that it takes to read the same number back, of float64 up to 17 and of float32 up to 9.
@@ -260,6 +260,9 @@ def write_csv(path: str | PathLike, solution: Any):
     Args:
         path: of the file, which is replaced if it exists.
         solution: as in `columns`.
+
+    Returns:
+        None.
 
     Raises:
         TypeError, ValueError: as `columns`.
