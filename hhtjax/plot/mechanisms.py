@@ -197,6 +197,8 @@ def _scene(caller: str, ax, frames: list, unit: str | None):
                 axis.set_major_locator(MaxNLocator(1 + int(5 * length)))
         else:
             panel.set_aspect("equal")
+            if size[0] < size[1] / 2:  # narrow: more labels would overlap
+                panel.xaxis.set_major_locator(MaxNLocator(2))
         yield panel
 
 
