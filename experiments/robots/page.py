@@ -79,7 +79,7 @@ def verdicts(cases, key: str, aim: float) -> str:
         value = rows[key][rows["h_s"].index(STEP)]
         met = value is not None and value <= aim
         lines.append(f"{'reached' if met else 'missed'} with {short(case)}")
-    return f"With the default `hht()` it is {'; '.join(lines)}."
+    return f"With the default `hht()` the target is {'; '.join(lines)}."
 
 
 def short(case) -> str:

@@ -11,23 +11,24 @@ that is driven to an angle:
 >>> run = hhtjax.simulate(
 ...     arm.system, hhtjax.hht(), arm.q0, arm.v0, arm.params | {"ctrl": jnp.array([-0.5])}, dt=5e-3, num_steps=400)
 >>> run.check()
->>> round(float(run.q[-1, 0]), 2)                                           # gravity holds it off by m g c/kp
+>>> round(float(run.q[-1, 0]), 2)                                           # gravity deflects it by m g c/kp
 -0.49
 
 All numbers of a mechanism are in `params`, a dict of arrays: they can be fitted, differentiated, and run in batches.
-The exception are positions and axes. They are part of the program, because known zeros make it fast;
+Positions and axes are exceptions: they are part of the compiled program, which is faster because it knows their zeros.
 `free=("position",)` puts positions into params.
 
 From a file
 -----------
 
 `load` reads MJCF and URDF files, with the package mujoco (`pip install "hhtjax[models]"`). If the file contains
-features that are not modelled here, an error lists all of them. Pass their names to ignore them:
+features that are not modelled here, an error lists all of them. To load it without them, pass their names as
+`ignore=`. `joints=` adds numbers that the file does not contain:
 
 >>> from hhtjax import bodies
 >>> pendulum = bodies.load('''<mujoco><worldbody><body name="rod"><joint name="pivot" axis="0 1 0"/>
 ...     <inertial mass="1" pos="0 0 -0.5" diaginertia="0.08 0.08 0.001"/></body></worldbody></mujoco>''',
-...     joints={"pivot": {"friction": 0.1, "damping": 0.02}})                    # what the file does not say
+...     joints={"pivot": {"friction": 0.1, "damping": 0.02}})                    # not in the file
 >>> pendulum
 Mechanism(1 bodies, 1 rates, 0 motors)
 
@@ -35,7 +36,7 @@ Friction from a record
 ----------------------
 
 `equation_error` estimates dry friction with its 95 % interval from encoders and motor torques, without simulation. The
-record in this example is generated, with 1.5 and 0.7 N m and noise:
+record in this example is generated, with friction of 1.5 and 0.7 N m, and with noise:
 
 >>> import jax, numpy as np
 >>> arm = bodies.load('''<mujoco><worldbody><body name="upper">
@@ -61,10 +62,10 @@ elbow: 0.696 N m, 0.688 to 0.704
 Coordinates
 -----------
 
-q and v are arrays (n,) if there are only hinges and slides; `Mechanism.index` gives the place of a joint in them.
-Otherwise q is a dict: "ball" has rotation matrices (., 3, 3) from the body to its parent; "free" has "R" (., 3, 3) and
-"x" (., 3) in the world; "joint" has hinges and slides. v has material angular velocities (., 3) instead of matrices.
-Motors with an activation add internal states: start runs with `z0=robot.z0`, which is None if there are none.
+q and v are arrays (n,) if there are only hinges and slides; `Mechanism.index` gives the index of a joint. Otherwise q
+is a dict: "ball" has rotation matrices (., 3, 3) from the body to its parent; "free" has "R" (., 3, 3) and "x" (., 3)
+in the world; "joint" has hinges and slides. v has angular velocities (., 3), in the axes of the body, instead of
+matrices. Motors with an activation add internal states: start runs with `z0=robot.z0`, which is None if there are none.
 
 Loops
 -----

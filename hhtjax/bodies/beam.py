@@ -36,8 +36,8 @@ def beam(
         moment = k (angle + damping d(angle)/dt),    k = EI/h or GJ/h
 
     Errors fall as 1/elements^2. A tip force F bends the clamped beam by F L^3/(3 EI) (1 - 1/(4 elements^2)).
-    Frequencies are too high: the first by 1.5 % with 4 elements and by .36 % with 8, the second by 5.2 % and 1.3 %. The
-    total rotation may be large; the angle of each spring must be small. Shear and extension are neglected.
+    Frequencies are too high: the first by 1.5 % with 4 elements and by 0.36 % with 8, the second by 5.2 % and 1.3 %.
+    The total rotation may be large; the angle of each spring must be small. Shear and extension are neglected.
 
     Args:
         name: name of the beam. Its pieces are NAME1, ..., NAME(elements + 1); the frame of each is at its beginning.
@@ -62,8 +62,8 @@ def beam(
         R. Huston, Multi-body dynamics including the effects of flexibility and compliance, Comput. Struct. 14, 1981,
         443-451; E. Wittbrodt, I. Adamiec-Wojcik, S. Wojciech, Dynamics of Flexible Multibody Systems, 2006, Ch. 3.
 
-    Example: a steel bar (1 m, 20 mm by 5 mm). It sags by rhoA g L^4/(8 EI), and the model by 1 - 1/(2 elements^2) of
-    this.
+    Example: a steel bar (1 m, 20 mm by 5 mm), clamped at one end. Its tip sags by rhoA g L^4/(8 EI). The tip of the
+    model sags by 1 - 1/(2 elements^2) times this.
 
     >>> import hhtjax
     >>> from hhtjax import bodies

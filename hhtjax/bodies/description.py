@@ -1,8 +1,8 @@
 """The parts of a mechanism as the user describes it: bodies, joints, motors, loops, markers. SI units.
 
-Frames: a body is attached to its parent at `position` and `rotation`, both in the frame of the parent. Then follow its
-joints in their order; each is fixed in the frame that the joints before it have moved. The frame after the last joint
-is the frame of the body. Its centre of mass, its inertia, and the bodies attached to it are given in this frame.
+Frames: a body is attached to its parent at `position` and `rotation`, both in the frame of the parent. Its joints
+follow in their order: each joint moves the frame in which the next one is fixed. The frame after the last joint is the
+frame of the body. Its centre of mass, its inertia, and the bodies attached to it are given in this frame.
 """
 
 from __future__ import annotations
@@ -95,8 +95,8 @@ class Joint:
         axis: in the frame of the body; it is normalised. The two directions of "planar" are the images of x and y under
             the shortest rotation from z to `axis`.
         anchor: a point of the axis, or the centre of a ball, in the frame of the body, m.
-        name: of the joint; None for the name of its body. Further unnamed joints of a body are BODY_2, ..., and a
-            spring on the axis of the previous joint, as made by `flexible`, is JOINT_spring.
+        name: of the joint; None for the name of its body. Further unnamed joints of a body are named BODY_2, ... An
+            unnamed spring on the axis of the previous joint, as made by `flexible`, is named JOINT_spring.
         stiffness, rest: of a spring, N m/rad or N/m, and the coordinate at which it is relaxed. Balls and free joints
             are relaxed in the described position; `rest` must then be 0. For joints with several rates, one number
             applies to all.
@@ -242,7 +242,7 @@ class Motor:
         "filter"      zdot = (u - z)/timeconst
 
     Args:
-        joint: name of a revolute or prismatic joint. kind: one of the three.
+        joint: name of a revolute or prismatic joint. kind: "torque", "position" or "velocity", see above.
         gear: transmission ratio. gain, kp, kv: see the formulas. name: None for the name of the joint.
         offset: a constant force, added to F.
         ctrlrange, forcerange: (lowest, highest) of u and of F, which are clipped; None for no limits.
@@ -356,7 +356,7 @@ class Couple:
     """Couples a joint to another, as by gears or a linkage: q1 - r1 = c0 + c1 (q2 - r2) + c2 (q2 - r2)^2 + ...
 
     Args:
-        first, second: names of revolute or prismatic joints; if second is None, the first is held at r1 + c0.
+        first, second: names of revolute or prismatic joints; if second is None, the first is fixed at r1 + c0.
         coefficients: c0, c1, ... origins: (r1, r2).
 
     Raises: TypeError, ValueError: an argument of a wrong kind or value.

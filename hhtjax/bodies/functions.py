@@ -41,8 +41,9 @@ def _known(caller: str, robot: Mechanism, params: PyTree, q: PyTree, **rates_giv
 
 
 def inverse_dynamics(robot: Mechanism, q: PyTree, v: PyTree, w: PyTree, params: PyTree = None) -> PyTree:
-    """The joint torques needed for the accelerations w: M(q) w + bias(q, v), with armature and gravity, no other
-    forces.
+    """The joint torques needed for the accelerations w: M(q) w + bias(q, v).
+
+    They include armature and gravity, and no other forces.
 
     Args: robot: a `Mechanism`. q, v, w: as in its system. params: None for `robot.params`.
     Returns: structured like v, N m and N.

@@ -57,11 +57,11 @@ class Mechanism:
             about the centre of mass in the frame of the body. For each rate: damping, armature (nv,). For each hinge or
             slide: stiffness, springref (ns,). gravity (3,). With motors: gear, gain, kp, kv, offset, ctrl (na,), where
             ctrl may be a function of t; and timeconst (na,) if some are filters. With dry friction: frictionloss (k,),
-            for the rates in `rubbing`. If asked for: position (number of all bodies, 3), first of the bodies in
-            `bodies`, in their order, then of the bodies without a mass that moves, in the order of the description;
-            spring_stiffness, stop_stiffness, stop_damping, restitution. You may add "torque", a generalised force
-            structured like v, and "wrench", {body: (moment, force) (6,)} in world axes, at the origin of the body or
-            marker. Both may be constants or functions of t.
+            for the rates in `rubbing`. Depending on the arguments of `tree`: position (number of all bodies, 3), first
+            of the bodies in `bodies`, in their order, then of the bodies without a mass that moves, in the order of the
+            description; spring_stiffness, stop_stiffness, stop_damping, restitution. You may add "torque", a
+            generalised force structured like v, and "wrench", {body: (moment, force) (6,)} in world axes, at the origin
+            of the body or marker. Both may be constants or functions of t.
         q0, v0: the described position, moved to close the loops if they were open, and zero velocity. q is (ns,) if
             there are only hinges and slides, else a dict: "ball" (., 3, 3), "free" {"R": (., 3, 3), "x": (., 3)}, and
             "joint" (ns,). v is structured like q, with material angular velocities (., 3) instead of rotations.
@@ -180,8 +180,9 @@ def tree(
         markers: each a `Marker`, an additional frame.
         gravity: (3,), m/s^2; default: standard gravity, 9.80665 downwards. (A file read by `load` has 9.81.)
         friction: "dry": the set-valued friction of the joints (`System(friction=)`); or "ignore".
-        limits: what happens at the ends of a `range`; None if no joint has one. "ignore": nothing; "stop": stiff
-            springs with damping, with stop_stiffness and stop_damping in params; "event": impacts (`Mechanism.events`).
+        limits: what happens at the ends of a `range`. "ignore": nothing; "stop": stiff springs with damping, with
+            stop_stiffness and stop_damping in params; "event": impacts (`Mechanism.events`). None is allowed only if no
+            joint has a range.
         free: ("position",) puts the positions of bodies into params. Otherwise they are part of the program, which is
             faster because it knows their zeros.
 

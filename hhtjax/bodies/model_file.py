@@ -1,7 +1,7 @@
 """`load`: mechanisms from MJCF and URDF files. The package mujoco only reads them (extra `models`).
 
-Features of a file that the equations here do not model raise one error that lists all of them, unless they are ignored
-by name. So an incomplete model is never run by accident. The docstring of `load` lists the names.
+If a file has features that the equations here do not model, one error lists all of them. `ignore` takes the names of
+features to leave out. So an incomplete model is never run by accident. The docstring of `load` lists the names.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def load(
         gravity: (3,), m/s^2, instead of that of the file. None takes that of the file, which is (0, 0, -9.81) if the
             file does not give it, as in mujoco. (The default of `tree` is standard gravity, 9.80665.)
         friction, free: as in `tree`.
-        limits: "ignore", "stop" or "event", as in `tree`; None if there are none. "ignore" is the same as
+        limits: "ignore", "stop" or "event", as in `tree`; None only if the file has no ranges. "ignore" is the same as
             ignore=("limits",). It is the only choice for a file with a ball joint that has a range: such a cone can be
             neither a stop nor an event here.
 
@@ -89,9 +89,9 @@ def load(
         "springyield": springs that yield. "polynomial": springs and dampers that are not linear.
         "unphysical": links of a URDF with physically impossible moments of inertia; ignored, all three are replaced by
             their mean.
-        "massless": bodies with an inertia but no mass, which then lose the inertia; and joints of a URDF that move no
-            mass or turn no inertia, and have no armature, which are then fixed. `joints` can add an armature, `more` a
-            mass.
+        "massless": bodies with an inertia but no mass; ignored, they lose the inertia. Also joints of a URDF without
+            armature that move no mass or turn no inertia; ignored, they are fixed. Instead of ignoring them, add an
+            armature with `joints`, or a mass with `more`.
 
     Raises:
         ImportError: mujoco is not installed. FileNotFoundError: no such file.

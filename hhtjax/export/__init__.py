@@ -1,7 +1,7 @@
 """Export of a model as C99, or as an FMU, for hard real time and for other programs.
 
 A Python process cannot guarantee deadlines of a millisecond, because the operating system and the garbage collector
-interrupt it from time to time. So the step and its parameters can be exported. `export_c` writes two files of C99
+interrupt it from time to time. Therefore you can export the step and its parameters. `export_c` writes two files of C99
 without dependencies. `export_fmu` writes a functional mock-up unit (FMI 3.0, Co-Simulation) for Simulink, OpenModelica,
 Dymola and others.
 
@@ -16,6 +16,9 @@ Dymola and others.
 ['q_arm', 'v_arm', 'w_arm', 'a_arm', 'dq_arm_dk', 'dv_arm_dk', 'dw_arm_dk', 'da_arm_dk']
 >>> [field.name for field in model.params], [field.name for field in model.inputs]
 (['c', 'k'], ['torque'])
+
+`sensitivities` adds the derivatives with respect to these parameters to the state. Each `sampled` function in params,
+such as the torque, becomes an input.
 
 `model.write(folder)` writes arm.c and arm.h. A control loop with them:
 
@@ -35,8 +38,8 @@ The C code
 The code is a list of operations on single numbers, each evaluated once and stored in a constant. Branches ("auto",
 Newton's iteration) stay branches; `jnp.where` is not a branch. Short loops with a fixed count are unrolled. Elimination
 with more than eight unknowns is a loop over an array. Singular values, for `redundant="least_squares"`, are computed by
-rotations. C and `simulate` agree to rounding. `experiments/export/README.md` has measured step times, and deadlines
-kept and missed.
+rotations. C and `simulate` agree to rounding. `experiments/export/README.md` has measured step times, and how often a
+loop missed its deadline.
 
 Each call of the step reads params and dt. For a `LinearSystem` of more than eight unknowns, the factors of the matrix
 are kept in the state. They are computed again when dt, or a parameter of the matrix, changes. That step takes longer,

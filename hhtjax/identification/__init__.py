@@ -28,19 +28,20 @@ Textbook standard errors assume that every residual is independent noise. The re
 because the model is never quite right. Textbook errors are then several times too small. `fit` therefore cuts the
 record into segments that are long compared with the correlation time. The standard error comes from the scatter between
 the segments. (In the literature: a cluster-robust, or "cluster sandwich", covariance.) `result.summary()` shows the
-ratio of this error to the textbook's.
+ratio of this error to the textbook error ("error / naive"). `profile` checks an interval by further fits: it fixes one
+parameter at several values and fits the others again.
 
 Derivatives of estimates
 ------------------------
 
 Estimates are differentiable with respect to the inputs of a fit: samples, weights, priors, and all values that the
-residuals read. Example: how the stiffness changes with the mass, which was assumed to be known. (The motion determines
-only k/m.)
+residuals read. Example: the derivative of the stiffness with respect to the mass, which was assumed to be known. (The
+motion determines only k/m.)
 
 >>> def stiffness(m):
 ...     known = lambda unknown: simulated(unknown | {"m": m}) - measured
 ...     return hhtjax.fit(known, result.params, covariance=False).params["k"]
->>> round(float(jax.jacfwd(stiffness)(1.0)), 2)                              # k/m; by jax.grad too
+>>> round(float(jax.jacfwd(stiffness)(1.0)), 2)                              # k/m; jax.grad works too
 2.0
 
 Options of a fit
@@ -54,7 +55,7 @@ option          meaning
 `loss=`         robust against outliers: `"huber"`, `"soft_l1"`, `"cauchy"`
 `prior=`        `Gaussian(mean, deviation)`: prior knowledge of a parameter
 `records=`      many records, or `windows` of one record. Each has its own initial values (`starts=`), which are fitted
-                too. They are eliminated, so that a step costs as much as if only the parameters were unknown
+                too. They are eliminated from each step, so that its linear system contains only the parameters
 ==============  ==================================================================================================
 
 The algorithm
@@ -68,27 +69,38 @@ valley. The correction needs no further simulation.
 
 A fit ends when the gradient vanishes. It also ends when the last step changes the cost, or the unknowns, by less than
 `tolerance`. In that case two more conditions must hold: the gradient or the residual is small; and the damping is
-small, or an undamped step would reduce the residual only a little. With dry friction or stops the cost can have kinks.
-A kink can be a local minimum, and which one a fit finds depends on its path. Fit again from points near the estimate,
-and keep the lowest cost.
+small, or an undamped step would reduce the residual only a little.
+
+With dry friction or stops the cost can have kinks. Each kink can be a local minimum, and the path of a fit decides
+which one it finds. Fit again from points near the estimate, and keep the result with the lowest cost. `unconstrained`
+gives the coordinates of a fit to optimisers of other packages.
 
 Initial guesses
 ---------------
 
 `equation_error` needs no guess: it inserts the measured motion into the equations of motion. `fit_progressively` starts
-from a poor guess and fits longer and longer parts of a record. `multistart` fits from many guesses at once.
+from a poor guess and fits longer and longer parts of a record. `multistart` runs many fits at once, each from its own
+guess.
 
 Sensors
 -------
 
-`measure` gives the readings of sensors along a run: at their own times, with gain, offset, drift and delay.
-`accelerometer` is one such sensor.
+`measure` gives the readings of sensors along a run, with gain, offset, drift and delay. Each sensor can have its own
+sampling times. `accelerometer` makes one such sensor. `windows` cuts a record into parts. `wrap_angle` removes
+whole turns from an angle.
+
+Robots
+------
+
+`base_parameters` finds the combinations of inertial parameters that motions can identify. `excitation` finds a motion
+that identifies them well. `physical_inertia` keeps the mass and inertia of a body physically possible during a fit;
+`inertia_coordinates` is its inverse, for the initial guess.
 
 Choosing a model
 ----------------
 
 `score_test` ranks terms that a model does not have yet. `compare` compares fitted models by AIC and BIC, by F tests of
-nested models, and by their errors on segments that were left out. Both allow for correlated residuals.
+nested models, and by their errors on segments that were left out of the fit. Both allow for correlated residuals.
 
 The step size is part of the model
 ----------------------------------
@@ -98,9 +110,9 @@ damped. `step_size_bias` predicts this error of a parameter for motion near reso
 the error from the stiffness. It removes it from the damping too if the masses were fitted, or if a single mode vibrates
 freely. `refine` works for any motion: it fits with dt, dt/2, ... and extrapolates all parameters to dt = 0.
 
-Results for two measured systems, `silverbox` and `double_pendulum_measured`, are in
-`experiments/identification/README.md`. The page also shows what can be identified in principle: stiff joints, a
-vehicle, and a mechanism with six constraints.
+`experiments/identification/README.md` has results for four measured systems (`silverbox`, `double_pendulum_measured`,
+`emps`, `tanks`) and a simulated benchmark with hysteresis (`bouc_wen`). It also tests the intervals on generated
+records with known parameters: stiff joints, a vehicle, and a mechanism with six constraints.
 """
 
 from hhtjax.identification.arguments import Gaussian

@@ -10,9 +10,9 @@ x = w h/2
 
 The response to a force is wrong too, by 1 + (w h)^2/3 + ... If the force is known, this is an error of the mass.
 
-All this holds for motion at the frequencies of the modes: free, or near resonance. A force at another frequency W
-causes motion at W. A stiffness fitted with a known mass is then off by m W^2 (W h)^2/6, which the eigenvalues do not
-show.
+All this holds for motion at the frequencies of the modes: free vibration, or a force near resonance. A force at another
+frequency W causes motion at W. A stiffness fitted with a known mass is then off by m W^2 (W h)^2/6, which the
+eigenvalues do not show.
 """
 
 from __future__ import annotations
@@ -90,9 +90,9 @@ def step_size_bias(
     """The error of stiffness and damping that were fitted with steps of dt.
 
     The system is linearised about (q, v, t0) with the fitted params: M, C = -dQ/dv, K = -dQ/dq. Each of its eigenvalues
-    s' is compared with s = log(mu)/dt, where mu is the corresponding eigenvalue of the amplification matrix of the real
-    step. The data have s. Constraints are linearised too: M, C and K are then those of the motions that the constraints
-    allow, and K includes the stiffness of the constraint forces.
+    s' is compared with s = log(mu)/dt, where mu is the corresponding eigenvalue of the amplification matrix of the
+    stepper. s is the eigenvalue of the measured motion. Constraints are linearised too: M, C and K are then those of
+    the motions that the constraints allow, and K includes the stiffness of the constraint forces.
 
     The prediction does not hold for parameters fitted to motion far from the frequencies of all modes, as under a force
     off resonance. Their bias depends on that motion; use `refine`.
@@ -102,19 +102,21 @@ def step_size_bias(
         params: the fitted parameters.
         q: an equilibrium, or another point about which the motion is small. It must satisfy the constraints.
         v: velocity there, structured like q, 0 by default. t0: time there.
-        correct: True returns corrected `params`: the smallest relative changes with which the equations have the
-            eigenvalues s and the steps' response to forces ("pre-warped"). This removes the bias of all parameters if
-            the masses were fitted too (with several modes: every entry of M), or if the motion was the free vibration
-            of one mode. Otherwise the fit was a compromise between response and eigenvalues, which depends on the
-            motion. Then only the frequencies are corrected, damping stays as fitted, and a warning says so. Parameters
-            without influence on the linearised system are unchanged. Instead of True, pass Booleans for the leaves of
-            params, or for whole branches: False for parameters that were not fitted, such as a known mass.
+        correct: True returns corrected `params`. They differ from the fitted ones by the smallest relative changes with
+            which the equations have the eigenvalues s, and respond to forces as the steps did ("pre-warping"). This
+            removes the bias of all parameters in two cases: the masses were fitted too (with several modes: every entry
+            of M), or the motion was the free vibration of one mode. Otherwise the fit was a compromise between response
+            and eigenvalues, which depends on the motion. Then only the frequencies are corrected, damping stays as
+            fitted, and a warning says so. Parameters without influence on the linearised system are unchanged. Instead
+            of True, pass Booleans for the leaves of params, or for whole branches: False for parameters that were not
+            fitted, such as a known mass.
 
     Returns:
         A `ModeBias`; NaN for a mode that does not oscillate in the steps.
 
     Warns:
-        StepSizeWarning: no params have the steps' response to forces. `refine` corrects them, with two or three fits.
+        StepSizeWarning: no params make the equations respond to forces as the steps did. Use `refine`, which takes two
+            or three fits.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind; dt is not a positive number; q has another number of

@@ -99,7 +99,8 @@ class Comparison(NamedTuple):
         """Name of the recommended model.
 
         With cross-validation: the model with the fewest parameters among those whose difference from the best model is
-        at most its standard error (Breiman, Friedman, Olshen, Stone 1984, Sec. 3.4.3). Without: that of lowest BIC.
+        at most its standard error (Breiman, Friedman, Olshen, Stone 1984, Sec. 3.4.3). Without: that with the lowest
+        BIC.
         """
         if self.held_out is None:
             return self.names[int(np.argmin(self.bic))]
@@ -107,7 +108,7 @@ class Comparison(NamedTuple):
         return self.names[int(np.argmin(np.where(close, self.parameters, np.inf)))]
 
     def summary(self) -> str:
-        """The table as text. Each p value names the smaller model; the textbook's p value is in brackets."""
+        """The table as text. Each p value names the smaller model; the textbook p value is in brackets."""
         return as_text(self._table())
 
     def _table(self) -> Table:
@@ -157,7 +158,7 @@ def compare(
     The textbook test is given too: ((S_0 - S_1)/q)/(S_1/(n - k_1)) ~ F(q, n - k_1). A model is nested in another if the
     names of its fitted parameters are among those of the other.
 
-    With `residuals` each model is cross-validated: it is fitted again, from its estimate on, with one of `folds`
+    With `residuals` each model is cross-validated: it is fitted again, starting from its estimate, with one of `folds`
     segments left out, and evaluated on that segment. This needs no formula and no assumption of white noise. Segments
     are contiguous, so that the segment left out is hardly correlated with the rest.
 
@@ -170,7 +171,7 @@ def compare(
         absent: the value at which an additional parameter has no effect, or {parameter: value} with the names in
             `FitResult.summary()`; 0 for the others. It is needed if the smaller model has a constant in its function
             instead of the parameter. If the smaller model has the parameter as a fixed one, that value is used. The
-            summary questions `absent` if the first p value is tiny and the textbook's is not.
+            summary warns that `absent` may be wrong if `p_value` is tiny and `naive_p_value` is not.
         always: Booleans, as `weights` of `fit`: True for residuals that are in every fit and are never evaluated, such
             as the first samples if they alone determine the initial state.
         progress: show in one line on stderr which fit is running.

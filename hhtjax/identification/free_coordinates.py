@@ -25,19 +25,19 @@ class Unconstrained(NamedTuple):
 
 
 def unconstrained(params0: PyTree, transforms: PyTree = None, scale: PyTree = None) -> Unconstrained:
-    """Coordinates x without bounds for parameters with bounds, for optimisers that know of none.
+    """Unbounded coordinates x for parameters with bounds, for optimisers that do not support bounds.
 
-    An optimiser of optax, optimistix or SciPy moves x, and the cost of x is that of `params(x)`. `fit` does the same by
-    itself, with optax too.
+    Let an optimiser of optax, optimistix or SciPy change x, and compute the cost from `params(x)`. `fit` uses these
+    coordinates by itself, also with an optax optimiser.
 
     Args:
-        params0, transforms, scale: as in `fit`. What is `fixed` is not in x.
+        params0, transforms, scale: as in `fit`. x does not contain `fixed` parameters.
 
     Returns:
-        An `Unconstrained`: the start and the way back.
+        An `Unconstrained`: the start x0, and the function from x to params.
 
     Raises:
-        TypeError, ValueError: as `fit`, for these; no free parameter.
+        TypeError, ValueError: as `fit`, for these arguments; no free parameter.
 
     >>> import hhtjax
     >>> free = hhtjax.identification.unconstrained({"k": 2.0, "m": 1.0}, {"k": hhtjax.positive, "m": hhtjax.fixed})

@@ -109,8 +109,8 @@ def fit(
         executor: its workers evaluate the `records`, as for `parallel_map`. Needs Levenberg-Marquardt, and a call
             outside jit. A worker returns a small triangular matrix for each record, with one row and column for each
             unknown. Residuals and Jacobians are returned once, at the minimum, for the standard errors. Steps have no
-            geodesic acceleration, which would need the Jacobians, so the fit may take more iterations. The minimum is
-            the same.
+            geodesic acceleration, because this would need the Jacobians in every step. So the fit may take more
+            iterations. The minimum is the same.
         mesh: CPU devices that evaluate the records instead of an executor: `jax.make_mesh((2,), ("records",))`.
         chunk: number of records in each task of the executor.
 
@@ -122,16 +122,17 @@ def fit(
 
     Derivatives: estimates have forward and reverse derivatives with respect to all inputs of the fit and to all values
     that its residuals read, except the initial guess. They are the derivatives of the minimum, by the implicit function
-    theorem: H dx + (dg/dd) dd = 0, with data d, the slope of the cost g = dc/dx, and H = dg/dx. They are valid only if
-    the fit has converged: check `result.code`, and use a small `tolerance`.
+    theorem: H dx + (dg/dd) dd = 0. Here c is the cost, x are the fitted parameters, d the inputs, g = dc/dx and
+    H = dg/dx. The derivatives are valid only if the fit has converged: check `result.code`, and use a small
+    `tolerance`.
 
     Error control: residuals may simulate with `dt=adaptive(...)`, also in `sweep`. Levenberg-Marquardt fits with frozen
     steps, chooses the steps again at the estimate, and repeats this until the estimates change by less than a tenth of
     their standard errors. `result.choices` is the number of repetitions. If the error control leaves errors larger than
-    the noise, the fit ends with "the estimates change whenever steps are chosen anew".
+    the noise, the fit stops with the reason "the estimates change whenever steps are chosen anew". Then reduce rtol.
 
-    The step size: residuals of a simulation contain its error, and the estimates follow. Standard errors do not include
-    this bias. Fit again with half the step, or use `refine`; `step_size_bias` predicts it.
+    The step size: residuals of a simulation contain the error of its steps, which shifts the estimates. Standard errors
+    do not include this bias. Fit again with half the step, or use `refine`; `step_size_bias` predicts it.
 
     Returns:
         A `FitResult`. Outside jit and vmap, problems raise an error or a warning. Inside them, check `result.code`.

@@ -94,7 +94,7 @@ def refine(
         levels = 3    the same formula with p + 1, applied to the R of (dt, dt/2) and the R of (dt/2, dt/4)
 
     A stepper that conserves the energy of an oscillation, like alpha = 0, has no error of order h^(p + 1). Two levels
-    are then enough. Numerical damping is an error of that order. Three levels remove it too; the third fit takes four
+    are then enough. The error of numerical damping has this order. Three levels remove it too; the third fit takes four
     times as long as the first.
 
     Fitted parameters belong to the step size of their fit. To simulate with dt, use `fits[0].params`. For the physical

@@ -43,7 +43,7 @@ def measure(
         y(t) = gain s(t - delay) + offset + drift (t - t0)
 
     The signal s is the position q, or `output`, a function of the motion. If the run was made with `output=`, s is its
-    saved output, with straight lines between the saved times. Before the start t0 of the run, s has its value at t0.
+    saved output, interpolated linearly between the saved times. Before the start t0 of the run, s has its value at t0.
 
     gain, offset, drift and delay can be parameters of a fit. A gain, a stiffness and a mass cannot all be fitted: the
     data determine only their ratios. Several sensors are entries of a dict that `output` returns. Each of `times`,
@@ -55,10 +55,11 @@ def measure(
         times: (samples,), s, not after the end of the run; or one such array for each sensor.
         gain, offset, drift: numbers, or arrays with the shape of a sensor's reading; drift per second.
         delay: numbers, s.
-        output: a function of some of q, v, w (the acceleration), L (multipliers), z, zdot, friction, sticking, t and
-            params, by these names: `output(q, w, params)`, `output(q, v, w, L, z, t, params)`. It returns any pytree.
-            Arguments that the system does not have are None. Values between the saved times are those of `interpolate`.
-            If events switch numbers in params, `output` still gets the params given here. See `accelerometer`.
+        output: a function whose arguments have some of the names q, v, w (the acceleration), L (multipliers), z, zdot,
+            friction, sticking, t, params: `output(q, w, params)`, `output(q, v, w, L, z, t, params)`. It returns any
+            pytree. Arguments that the system does not have are None. Values between the saved times are those of
+            `interpolate`. If events switch numbers in params, `output` still gets the params given here. See
+            `accelerometer`.
         params: passed to `output`, usually the params of the run.
 
     Returns:
@@ -326,7 +327,7 @@ def windows(t: Real, y: PyTree, duration: Real, present: Real | None = None) -> 
 def wrap_angle(angle: Real) -> Any:
     """Maps an angle to [-pi, pi) by adding whole turns.
 
-    Apply it to the difference of two angles if one of them was measured without its whole turns.
+    Apply it to the difference of two angles if whole turns are missing from one of the measurements.
 
     Args:
         angle: rad, an array of any shape.
