@@ -10,7 +10,7 @@ from experiments.scenes.scenes import PICTURES
 HERE = Path(__file__).parent
 HEAD = """# Gallery of scenes
 
-Systems to start from: each has numbers, a start and a duration, in SI units. Take one, run it, and draw it:
+Systems to start from: each has parameters, a start and a duration, in SI units. Choose one, run it, and draw it:
 
 ```python
 import hhtjax
@@ -21,9 +21,9 @@ run = hhtjax.simulate(scene.system, hhtjax.hht(), scene.q0, scene.v0, scene.para
 hhtjax.plot.animation(run, scene).save("double_pendulum.gif")
 ```
 
-A scene with events is run with `events=scene.events` too, one with internal states with `z0=scene.z0`. Where several
-times are drawn over each other, the earlier ones are paler. A sketch over a curve is the state at the dot. Equations
-and parameters are in [the reference](../../docs/api/scenes.rst). `python -m experiments scenes` draws the pictures.
+If a scene has events, also pass `events=scene.events`; if it has internal states, pass `z0=scene.z0`. If a picture
+shows several times, the earlier ones are paler. A sketch above a curve shows the state at the dot. Equations and
+parameters are in [the reference](../../docs/api/scenes.rst). `python -m experiments scenes` draws the pictures.
 """
 
 

@@ -104,7 +104,7 @@ PICTURES = {
     ),
     "lugre": Picture(
         scenes.lugre.stick_slip,
-        "A spring drags a mass over a surface: it sticks until the spring is strong enough, and slips.",
+        "A spring drags a mass over a surface: it sticks until the spring is strong enough, then slips.",
         (6.0,),
         ONE,
         MASS,
@@ -124,7 +124,7 @@ PICTURES = {
     ),
     "dry_oscillator": Picture(
         scenes.dry_oscillator.free,
-        "A mass on a spring and a dry surface turns five times and sticks.",
+        "A mass on a spring and a dry surface reverses five times, then sticks.",
         (0.0,),
         ONE,
         MASS,
