@@ -23,23 +23,24 @@ from hhtjax.systems.interop import ode
 from hhtjax.systems.system import AnySystem
 from hhtjax.xla import Programs
 
-CLOSED = 1e-8  # part of a motion by which it may miss its start; in float32 a thousandth
-MOVES = 1e-6  # part of the size of q by which a limit cycle moves at least
+CLOSED = 1e-8  # largest `left` of a motion that counts as periodic; about 1e-3 in float32
+MOVES = 1e-6  # least motion of a limit cycle, relative to the size of q
 
 
 @shown
 class PeriodicSolution(NamedTuple):
-    """What `periodic_solution` found.
+    """Result of `periodic_solution`.
 
     Attributes:
-        q, v, z: the state at t0, like q0, v0, z0; of a first-order system y, None, None.
+        q, v, z: the state at t0, like q0, v0, z0; for a first-order system y, None, None.
         period: T.
-        orbit: one period from there, a `Solution` with every step.
+        orbit: the motion over one period from this state, a `Solution` with every step.
         monodromy: d(state at t0 + T)/d(state at t0), (N, N); the state holds the numbers of q, then v, then z.
-        left: by how much the motion misses its start, over the largest value on the way, or of the given start: the
-            worst of q, v and z.
-        converged: whether that is no more than rounding, and a motion whose period was not known moves at all.
-        autonomous: whether the period was found.
+        left: the largest difference between the end of the period and its start, relative to the largest value during
+            the period or at the given start; the largest of q, v and z.
+        converged: whether `left` is at most 1e-8 (about 1e-3 in float32). With `find_period` the motion must also be
+            more than an equilibrium.
+        autonomous: whether the period was unknown, that is, `find_period`.
     """
 
     q: PyTree
@@ -55,15 +56,16 @@ class PeriodicSolution(NamedTuple):
     @property
     def multipliers(self) -> np.ndarray:
         """Floquet multipliers (N,), the eigenvalues of `monodromy`, largest modulus first: a small disturbance grows by
-        these factors in each period. Values below 1e-14 times the norm of `monodromy` are rounding. NumPy; under jit
-        use `monodromy`."""
+        these factors in each period. Values below 1e-14 times the norm of `monodromy` are rounding. A NumPy array;
+        under jit use `monodromy`."""
         found = np.linalg.eigvals(np.asarray(self.monodromy))
         return np.take_along_axis(found, np.argsort(-np.abs(found), axis=-1, kind="stable"), axis=-1)
 
     @property
     def stable(self) -> np.ndarray:
-        """Whether small disturbances die out: all multipliers lie inside the unit circle, for a limit cycle but one,
-        which is 1. Not so for motions without damping, whose multipliers lie on the circle."""
+        """Whether small disturbances die out, that is, all multipliers lie inside the unit circle. A limit cycle has
+        one multiplier of 1, which is left out. Motions without damping are not stable in this sense: their multipliers
+        lie on the circle."""
         found = self.multipliers
         size = np.abs(found)
         if np.any(self.autonomous):
@@ -71,7 +73,7 @@ class PeriodicSolution(NamedTuple):
         return np.all(size < 1 - np.sqrt(np.finfo(found.dtype).eps), axis=-1)
 
     def check(self):
-        """Raises ValueError where no periodic motion was found; silent when all is well. Call it outside jit."""
+        """Raises ValueError if no periodic motion was found. Call it outside jit."""
         if np.all(self.converged):
             return
         left = np.asarray(self.left)
@@ -104,29 +106,28 @@ def periodic_solution(
         state(t0 + T) = state(t0),    and with find_period    f0 . (state(t0) - (q0, v0, z0)) = 0
 
     with state = (q, v, z) after num_steps steps of T/num_steps, and f0 the rate of the state at (q0, v0, z0). The
-    second equation picks a point of the limit cycle. Levenberg and Marquardt's method solves both with the exact
-    derivative of the run. It finds unstable motions too.
+    second equation selects one point of the limit cycle as the start. The Levenberg-Marquardt method solves both with
+    the exact derivative of the run. It finds unstable motions, too.
 
-    The motion is periodic to rounding for these steps. It differs from that of the system by the error of the stepper:
-    some hundred steps of `tsit5` or `dop853` are accurate, `hht` needs more. A run of `hht` over many periods differs
-    from it by that error too: only its first step starts from the acceleration of the equations of motion.
+    The computed motion repeats to rounding. It differs from the exact motion by the error of the stepper: some hundred
+    steps of `tsit5` or `dop853` are accurate, `hht` needs more. A run of `hht` over many periods differs from it by
+    that error, too, because only the first step of such a run starts from the acceleration of the equations of motion.
 
     Args:
         system: a `System`, `LinearSystem` or `FirstOrderSystem`, without constraints, rotations, dry friction and
             contact.
-        stepper, q0, v0, params, t0, z0: as in `simulate`. The start must be near: several periods of a run that end
-            near t0 + k T give one for a stable motion.
-        period: T, of a motion that is driven: the period of its force, or a multiple for a subharmonic. It may depend
-            on params. With `find_period` a guess.
+        stepper, q0, v0, params, t0, z0: as in `simulate`. The start must be near the periodic motion. For a stable
+            motion use the end of a run over several periods, at a time near t0 + k T.
+        period: T. For a driven motion it is the period of the force, or a multiple for a subharmonic. It may depend on
+            params. With `find_period` it is an initial guess.
         num_steps: number of steps in a period.
-        find_period: whether the period is unknown too, as that of a limit cycle, of a system that does not depend on
-            time.
+        find_period: whether the period is unknown, too, as for a limit cycle. The system must then not depend on time.
 
     Returns:
         A `PeriodicSolution`: q, v, period, `orbit` (one period, a `Solution`), `monodromy`, `multipliers`, `stable`.
         If the motion is isolated, its arrays have derivatives with respect to params and period, forward and reverse,
-        by the implicit function theorem. An undamped free vibration is one of a family; its derivatives mean nothing.
-        Under jit nothing raises: look at `converged`.
+        by the implicit function theorem. An undamped free vibration is not isolated: it belongs to a family, and its
+        derivatives have no meaning. Under jit no error is raised: check `converged`.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; no periodic motion was found.
@@ -158,7 +159,7 @@ def periodic_solution(
 
 
 def _require_smooth_coordinates(caller: str, problem: Problem):
-    """An error for a system whose state is not a vector that may start anywhere."""
+    """Raises an error for a system whose state is not a vector, or may not start anywhere."""
     system = problem.system
     for name, advice in (
         ("constraint", "write it in minimal coordinates"),
@@ -218,14 +219,14 @@ def _flow(system: AnySystem, start: tuple, t0: Real, params: PyTree) -> Array:
 
 
 def _parts(run: Solution, start: tuple) -> list[Array]:
-    """q, v and z, what there is of them, as arrays (K + 1, numbers)."""
+    """Those of q, v and z that the system has, as arrays (K + 1, numbers)."""
     found = [x for x, given in zip((run.q, run.v, run.z), start, strict=True) if given is not None]
     return [jnp.concatenate([x.reshape(len(run.t), -1) for x in jax.tree.leaves(part)], axis=1) for part in found]
 
 
 def _judged(parts: list[Array], start: tuple) -> tuple[Array, Array]:
-    """What is left of a period, and how far it goes, both over the largest value, of the start given too; without
-    derivatives."""
+    """How far the end of the period is from its start, and how far q moves from its start. Both are relative to the
+    largest value, also of the given start, and have no derivatives."""
 
     def largest(x: Array) -> Array:
         return jnp.max(jnp.abs(lax.stop_gradient(x)))
@@ -238,5 +239,5 @@ def _judged(parts: list[Array], start: tuple) -> tuple[Array, Array]:
 
 
 def _enough(dtype: Any) -> float:
-    """What may be left."""
+    """The largest `left` of a motion that counts as periodic."""
     return max(CLOSED, 1e4 * float(jnp.finfo(dtype).eps))

@@ -19,7 +19,7 @@ from hhtjax.systems.initial_conditions import initial_values
 from hhtjax.systems.system import AnySystem, FirstOrderSystem, require_system
 from hhtjax.xla import Programs
 
-BALANCED = 1e-8  # part of the forces that may be left of their sum; in float32 a thousandth
+BALANCED = 1e-8  # largest `left` of an equilibrium; about 1e-3 in float32
 
 
 @shown
@@ -32,7 +32,7 @@ class Equilibrium(NamedTuple):
         z: internal states, like z0; None without internal states.
         left: the largest unbalanced force relative to the largest force; or, if that is larger, the largest
             violation of a constraint relative to that at q0 (relative to 1 if that is less than 1).
-        converged: whether the residual is only rounding.
+        converged: whether `left` is at most 1e-8 (about 1e-3 in float32).
     """
 
     q: PyTree
@@ -51,8 +51,8 @@ def equilibrium(
 
     with the force Q, the constraints Phi and the rates g of internal states. It is found by the Levenberg-Marquardt
     method, which also converges from starts from which Newton's method would diverge. A system may have several
-    equilibria, and the one found need not be stable. `hhtjax.analysis.suggest_step_size` at q lists the modes about it:
-    one with a negative damping ratio grows.
+    equilibria, and the one found need not be stable. To check this, call `hhtjax.analysis.suggest_step_size` at q: it
+    lists the modes, and a mode with a negative damping ratio grows.
 
     Args:
         system: a `System`, `LinearSystem` or `FirstOrderSystem`, without dry friction and contact.
@@ -62,8 +62,8 @@ def equilibrium(
         params, t0, z0: as in `simulate`.
 
     Returns:
-        An `Equilibrium`. If it is isolated, it has forward and reverse derivatives by params. Under jit no error is
-        raised: check `converged`.
+        An `Equilibrium`. If it is isolated, it has forward and reverse derivatives with respect to params. Under jit no
+        error is raised: check `converged`.
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; no equilibrium was found.

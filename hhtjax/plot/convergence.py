@@ -38,13 +38,13 @@ def error_against_h(
     the slopes of a curve differ by more than 1, the smallest and the largest are given instead.
 
     Args:
-        dt: step sizes (n,), with `error` of the same length; or an `ObservedOrder`; or a sweep over step sizes; or
-            several of these by name, {label: sweep} or {label: (dt, error)}.
-        error: (n,); None if dt is one of the others. Errors that are not finite or not positive are left out.
+        dt: step sizes (n,), with `error` of the same length; or an `ObservedOrder`; or a sweep over step sizes; or a
+            dict of several of these, {label: sweep} or {label: (dt, error)}.
+        error: (n,), if dt is step sizes; otherwise None. Errors that are not finite or not positive are left out.
         reference: for a sweep: the exact q of a member, at the same times; by default the finest member, which is then
             not drawn.
         label: label of a single curve.
-        slopes: orders of the triangles; by default the whole numbers that are observed.
+        slopes: orders of the triangles; by default the observed orders, if they are close to a whole number.
         unit: unit of the error. time_unit: unit of dt.
         lines: options of `ax.plot` for some of the curves, {label: {"marker": "x"}}.
         key: whether to draw a legend. Without it the labels of curves have no orders, so that several axes can share a

@@ -23,10 +23,10 @@ def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: 
 
         100 (x - reference) / |reference|,    x: the estimate and the ends of `result.interval(level)`
 
-    A parameter that the residuals do not determine is a cross without interval.
+    A parameter that the residuals do not determine is drawn as a cross without interval.
 
     Args:
-        results: a `FitResult` with covariance, or several fits of the same model by name, {label: result}.
+        results: a `FitResult` with covariance, or a dict of several fits of the same model, {label: result}.
         level: confidence level of the intervals, between 0 and 1.
         truth: the true params, if they are known; used as reference instead of the first estimate.
         entries: names of the parameters to draw, as in `result.summary()`; by default all that were fitted.
@@ -37,7 +37,7 @@ def estimates(results: Any, *, level: float = 0.95, truth: Any = None, entries: 
 
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; a fit without covariance; a parameter that is 0,
-        for which per cent are not defined (leave it out by `entries`).
+        for which a percentage is not defined (leave it out by `entries`).
 
     >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
     >>> t = jnp.arange(100.0)
@@ -143,7 +143,7 @@ def correlations(result: FitResult, *, ax: Any = None) -> Any:
 def profile(
     found: Profile, *, name: str = "parameter", unit: str | None = None, result: FitResult | None = None, ax: Any = None
 ) -> Any:
-    """Draws the deviance over one parameter, with its 95 % bound, 3.84. With `result` also the parabola
+    """Draws the deviance over one parameter, with its 95 % bound, 3.84. With `result` it also draws the parabola
 
         ((x - estimate) / standard error)^2.
 

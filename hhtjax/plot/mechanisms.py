@@ -35,27 +35,27 @@ def animation(
     unit: str | None = "m",
     ax: Any = None,
 ) -> Film:
-    """A film of a run: of a scene, a mechanism, or polylines through points that move, in the plane or in space.
+    """Makes a film of a run: of a scene, a mechanism, or polylines through moving points, in the plane or in space.
 
-    Frames are taken from dense output, at equal times, whatever the step size.
+    Frames are equally spaced in time for any step size. They are interpolated between the steps.
 
     Args:
-        solution: of one run.
-        points: what is drawn. A scene of `hhtjax.scenes`, by its `drawing`; or a `hhtjax.bodies.Mechanism`, whose
-            bodies are bars; or `points(q)` -> (k, 2) or (k, 3), the corners of a polyline, or a list or tuple of these
-            and of shapes of `hhtjax.scenes.drawings`.
+        solution: solution of one run.
+        points: what is drawn. A scene of `hhtjax.scenes` that has a `drawing`; or a `hhtjax.bodies.Mechanism`, whose
+            bodies are drawn as bars; or a function `points(q)`. It returns the corners of a polyline, (k, 2) or (k, 3),
+            or a list or tuple of polylines and of shapes of `hhtjax.scenes.drawings`.
         fps: frames per second of film.
         speed: time of the run for each second of film.
-        trace: number of a point of the first polyline whose path is drawn, or several.
-        unit: of length.
-        ax: axes to draw into, for points in space with projection="3d"; None for a figure of its own.
+        trace: index of a point of the first polyline whose path is drawn, or several indices.
+        unit: unit of length.
+        ax: axes to draw into, for points in space with projection="3d"; None for a new figure.
 
     Returns:
-        A `Film`, a `FuncAnimation` of matplotlib: `.save("film.gif")` writes a file, and as the last line of a cell it
-        plays in a notebook. Keep it until then, as matplotlib forgets what nobody holds.
+        A `Film`, a `FuncAnimation` of matplotlib. `.save("film.gif")` writes a file; as the last line of a notebook
+        cell it plays. Keep it in a variable until then, because matplotlib loses an animation without a reference.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind or value; points of another shape; a scene without a drawing.
+        TypeError, ValueError: an argument of a wrong kind or value; points of a wrong shape; a scene without a drawing.
 
     >>> import pathlib, tempfile, jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
     >>> scene = hhtjax.scenes.duffing.hardening_spring()
@@ -83,7 +83,7 @@ def animation(
     with _scene("animation", ax, frames, unit) as panel:
         bars = [panel.plot(*x.points.T, **_look(i, x.kind))[0] for i, x in enumerate(frames[0])]
         paths = [panel.plot(*frames[0][0].points[[i]].T, color=COLOURS[1], lw=0.8)[0] for i in traced]
-        told = max(0, 2 - int(np.floor(np.log10(max(end - start, 1e-9)))))  # decimals: of a run of 1 s two
+        told = max(0, 2 - int(np.floor(np.log10(max(end - start, 1e-9)))))  # decimals: two for a run of 1 s
         title = panel.set_title(f"t = {times[0]:.{told}f} s")
 
     def draw(k: int):
@@ -101,28 +101,28 @@ class Film(FuncAnimation):
     """An animation that plays in a notebook, and whose GIF needs no other program; made by `animation`."""
 
     def save(self, filename: Any, writer: Any = None, **options: Any):
-        """Writes a file, as `Animation.save` of matplotlib; without a writer, a .gif is written by Pillow."""
+        """Writes a file, like `Animation.save` of matplotlib. Without `writer` Pillow writes a .gif."""
         super().save(filename, "pillow" if writer is None and Path(filename).suffix == ".gif" else writer, **options)
 
     def _repr_html_(self) -> str:
-        """The film with buttons. A notebook would show the figure again, below it: so it is closed."""
-        shown, film = self.to_jshtml(), cast(Any, self)  # of whose figure matplotlib's types do not know
+        """The film with buttons. The figure is closed, because a notebook would show it again below the film."""
+        shown, film = self.to_jshtml(), cast(Any, self)  # matplotlib's types do not have its figure
         plt.close(film._fig)
         return shown
 
 
 def configuration(solution: Any, points: Any, times: Any, *, unit: str | None = "m", ax: Any = None) -> Any:
-    """A scene or a mechanism at some times, the earlier the paler.
+    """Draws a scene or a mechanism at some times. Earlier positions are paler.
 
     Args:
         solution, points, unit, ax: as in `animation`.
-        times: inside the run, one or a vector; dense output is between the steps.
+        times: a time within the run, or a vector of times; positions between the steps are interpolated.
 
     Returns:
         The axes.
 
     Raises:
-        TypeError, ValueError: an argument of a wrong kind or value; points of another shape; times outside the run.
+        TypeError, ValueError: an argument of a wrong kind or value; points of a wrong shape; times outside the run.
 
     >>> import jax.numpy as jnp, matplotlib.pyplot as plt, hhtjax
     >>> spring = hhtjax.System(jnp.ones(1), lambda q, v, t, params: -4.0 * q)
@@ -145,7 +145,7 @@ def configuration(solution: Any, points: Any, times: Any, *, unit: str | None = 
 
 
 def _frames(caller: str, solution: Solution, points: Any, times: np.ndarray) -> list[list[Shape]]:
-    """For each time the shapes, all of one dimension."""
+    """The shapes at each time; all are in the plane, or all in space."""
     shapes = _shapes(caller, points)
     q = interpolate(solution, times).q
     frames = []
@@ -160,7 +160,7 @@ def _frames(caller: str, solution: Solution, points: Any, times: np.ndarray) -> 
 
 
 def _shapes(caller: str, points: Any) -> Callable:
-    """A function of q and t."""
+    """The function of q and t that returns the shapes."""
     if isinstance(points, (Scene, EventScene, InternalScene)):
         drawing, params = points.drawing, points.params
         if drawing is None:
@@ -172,13 +172,13 @@ def _shapes(caller: str, points: Any) -> Callable:
 
 
 def _as_shape(x: Any) -> Shape:
-    """Points alone are those of a bar, in a colour of its own."""
+    """A shape. Points without a kind become a polyline with a colour of its own."""
     return Shape(np.asarray(x.points, float), x.kind) if isinstance(x, Shape) else Shape(np.asarray(x, float), "")
 
 
 @contextmanager
 def _scene(caller: str, ax, frames: list, unit: str | None):
-    """Axes of the right dimension, with limits that hold all frames and the same scale in every direction."""
+    """Axes in the plane or in space. Their limits contain all frames, and all directions have the same scale."""
     spatial = frames[0][0].points.shape[1] == 3
     if ax is not None and spatial != hasattr(ax, "get_zlim"):
         wanted = 'projection="3d"' if spatial else "two dimensions"
@@ -203,11 +203,11 @@ def _scene(caller: str, ax, frames: list, unit: str | None):
 
 
 def _height(width: Real, height: Real) -> Real:
-    """Of a figure, in mm, 85 wide, for a scene of this width and height; 25 for title and labels."""
+    """Height in mm of a figure 85 mm wide, for a scene of this width and height; 25 mm are for title and labels."""
     return min(max(25 + 65 * height / width, 40), 150)
 
 
-LOOKS: dict[str, dict] = {  # of kinds of shapes
+LOOKS: dict[str, dict] = {  # line properties for each kind of shape
     "bar": {"color": COLOURS[0], "marker": "o", "ms": 3.5, "lw": 1.6},
     "body": {"color": COLOURS[1], "lw": 1.4},
     "spring": {"color": COLOURS[2], "lw": 1.0},
@@ -218,12 +218,12 @@ LOOKS: dict[str, dict] = {  # of kinds of shapes
 
 
 def _look(i: int, kind: str) -> dict:
-    """Of a shape of a kind, or of the polyline with number i."""
+    """Line properties of a kind of shape, or of polyline number i."""
     return LOOKS[kind] if kind else look(i, marker=True) | {"ls": "-", "lw": 1.6, "ms": 3.5}
 
 
 def _move(line, x: np.ndarray):
-    """A line through other points."""
+    """Moves a line to new points."""
     if x.shape[1] == 3:
         line.set_data_3d(*x.T)
     else:

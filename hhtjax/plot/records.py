@@ -27,15 +27,15 @@ def fit_against_data(
 ) -> Any:
     """Draws measured and simulated output, the residual (measured - simulated), and spectra of record and residual.
 
-    A spectrum is the square root of the one-sided power spectral density, by Welch's method: a mean over half
-    overlapping windows of a quarter to a half of the record, from each of which its mean is subtracted. So its unit is
-    that of the output over the square root of a frequency, and the integral of its square is the variance.
+    A spectrum is the square root of the one-sided power spectral density, by Welch's method: the mean over windows of a
+    quarter to a half of the record, which overlap by half, each with its own mean subtracted. Its unit is that of the
+    output over the square root of a frequency. The integral of its square is the variance.
 
     Args:
         times: (N,), equally spaced, N >= 8.
         measured, simulated: (N,), in the same unit. NaN where nothing was measured; the spectra use the mean there.
         unit, ylabel: unit and name of the output.
-        time_unit: unit of times. frequency_unit: its reciprocal.
+        time_unit: unit of times. frequency_unit: the unit of 1/time_unit.
         show: (first, last), the part of the time to draw. Spectra use the whole record.
         names: names of the two records in the legend.
         ax: three axes to draw into, or two, for output and residual only; None for a new figure.

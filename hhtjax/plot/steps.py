@@ -132,7 +132,7 @@ def stability_region(
 
     Args:
         steppers: a stepper, or several by name, {label: stepper}.
-        real, imag: (smallest, largest) real and imaginary part of the drawn part of the plane.
+        real, imag: (smallest, largest), the range of the real and of the imaginary axis.
         points: number of points in each direction, at least 2. The edge is interpolated between them.
         ax: axes to draw into; None for a new figure.
 

@@ -63,8 +63,8 @@ Later calls
 -----------
 
 A later call of `simulate` takes some 0.2 ms of Python, to check its arguments and what its functions read. In your own
-jit this time disappears. A run of fifty steps of which only q is returned then takes a tenth longer than a loop over
-its steps alone; each further array of the `Solution` takes about a microsecond. Arrays in params are passed faster than
+jit this time disappears. If only q is returned, a run of fifty steps then takes a tenth longer than a plain loop over
+its steps; each further array of the `Solution` takes about a microsecond. Arrays in params are passed faster than
 Python numbers, and several arrays faster than one vector that is split inside. JAX passes programs of more than a
 thousand operations to another thread, which takes 10 us; `jax.config.update("jax_cpu_enable_async_dispatch", False)`,
 before anything else, avoids this. The page `experiments/benchmarks/README.md` has the measurements.
@@ -86,22 +86,22 @@ brings a mass to rest at zero in two periods:
 ...     return jax.lax.scan(run_for_a_period, (jnp.ones(1), jnp.zeros(1)), period * jnp.arange(4.0))[1]
 >>> cart = hhtjax.System(jnp.ones(1), lambda q, v, t, params: params["u"] - params["c"] * v)
 >>> runs = jax.jit(controlled)({"c": 0.0})                               # without jit each call traces it again
->>> runs.check()                                                         # what it calls members are the periods
+>>> runs.check()                                                         # in a message, members are the periods
 >>> runs.q.shape, [round(abs(float(q)), 6) for q in runs.q[:, -1, 0]]    # start and steps of each; its end
 ((4, 6, 1), [0.5, 0.0, 0.0, 0.0])
 
 Each run starts anew where the force jumps, so the method keeps its order. Derivatives pass through all runs, and each
 run is one kernel. 1500 periods of a crane with five steps each take half the time of plain JAX if only their ends are
-saved (`save_every=5`), and .7 of it if all steps are. The matrices of a `LinearSystem` are factorised once, before the
+saved (`save_every=5`), and 0.7 of it if all steps are. The matrices of a `LinearSystem` are factorised once, before the
 scan. Each start takes some 12 additional solves; `hht(start="simple")` avoids them if nothing is stiff. Continue
 internal states from `run.z[-1]`. For a held input that is known in advance use `sampled(order=0)`.
 
 Sweeps
 ------
 
-Step sizes, parameters, initial states and coefficients are data. Any list of step sizes is one compiled call, sampled
-at common times. Its work is about the sum of the steps of its members. A member that fails is flagged and does not
-affect the others.
+Step sizes, parameters, initial states and coefficients are data. One compiled call runs any list of step sizes, and
+samples all runs at the same times. Its work is about the sum of the steps of its members. A member that fails is
+flagged and does not affect the others.
 
 >>> dts = jnp.logspace(-3, -1, 9)                    # made smaller, if need be, to land on the samples: sweep.dt
 >>> sweep = hhtjax.sweep(pendulum, hhtjax.hht(), q0, v0, params, dts=dts, duration=2.0, num_samples=20)
@@ -128,9 +128,9 @@ If all devices are available from the start, run this in every process:
     sweep = hhtjax.sweep(pendulum, hhtjax.hht(), q0, v0, params, dts=dts, duration=2.0, num_samples=20, mesh=mesh)
 
 The results agree with those of one device to rounding: each device gets its own blocks of members, which XLA may
-compile differently. The page `experiments/sweeps/README.md` has the times of this, of large systems
-(`hht(solve=hhtjax.banded(p))`, or `conjugate_gradients(k)`, whose step time is proportional to the number of unknowns),
-and of a step at 1 kHz.
+compile differently. The page `experiments/sweeps/README.md` has the run times of such sweeps, and of large systems with
+`hht(solve=hhtjax.banded(p))` or `conjugate_gradients(k)`, whose step time is proportional to the number of unknowns. It
+also has those of single steps called at 1 kHz.
 
 Dense output
 ------------
@@ -149,9 +149,9 @@ Outputs
 -------
 
 With `output=`, `simulate`, `sweep` and `sweep_to_disk` save a function of the motion instead of q and v: sensor
-signals, energies, a distance. Its argument names say what it reads, of q, v, w (the acceleration), L (multipliers), z,
-zdot, friction, sticking, contact, t and params. A run of a million steps of a large system then keeps only what you ask
-for.
+signals, energies, a distance. The function receives the quantities that its arguments name: q, v, w (the acceleration),
+L (multipliers), z, zdot, friction, sticking, contact, t and params. A run of a million steps of a large system then
+keeps only what you ask for.
 
 >>> def felt(q, w, params):
 ...     return {"height": -params["l"] * jnp.cos(q[0]), "turning": w[0]}
@@ -250,10 +250,10 @@ differentiable in the times.
 For lasting contact use a `Contact` of the system (`hhtjax.systems`). In three dimensions, without friction, use a
 constraint that events switch on and off: on where the body reaches its stop, with `impact(0.0)`, and off where the
 multiplier falls to zero, by a guard with an argument `multipliers`. The number of constraints of a run is fixed, so a
-constraint that is off holds a coordinate of its own instead; see `hhtjax.scenes.shaken_table`. A body may start at rest
+constraint that is off fixes a separate coordinate instead; see `hhtjax.scenes.shaken_table`. A body may start at rest
 at its guard if its acceleration lifts it off.
 
-Failures are reported, and a run never ends beyond a guard: more changes in one step than `max_events`, as for a ball
+A run never ends beyond a guard. These failures are reported: more changes in one step than `max_events`, as for a ball
 that comes to rest; a guard that stays negative; two impacts at the same time; a start beyond a guard. Derivatives hold
 for a fixed order of events. If a motion only grazes a guard they grow without bound (see `run.events.rate`). A guard
 that falls below zero and rises again within a step is detected if the cubic through its values and rates at both ends
@@ -270,5 +270,6 @@ Extrapolation
 -------------
 
 `simulate(..., extrapolate=2)` or 3 combines two or three runs, with steps dt, dt/2 (and dt/4), to remove the leading
-errors in dt. The order is 3 and 4 where the motion is smooth and dt resolves it, and 3 with switches of dry friction.
+errors in dt. Where the motion is smooth and dt resolves it, the order is 3 with two runs and 4 with three. With
+switches of dry friction it is 3.
 """

@@ -59,8 +59,8 @@ def adaptive(
     `dopri5`, and below one with "tighten". Steps end where held inputs, `sampled(order=0)`, jump. With dry friction the
     error is that of the motion on either side of a switch: the jump of the acceleration does not reject a step.
 
-    With `events`, steps pass them as steps of given sizes do, and the remainder of a step after an event has its own
-    error estimate. Where there is no error, as in free flight, steps grow without bound. A guard that falls below zero
+    `events` divide steps as they do with given step sizes. The remainder of a step after an event has its own error
+    estimate. Where there is no error, as in free flight, steps grow without bound. A guard that falls below zero
     and rises again within one step may then be missed: give dt_max.
 
     In `sweep(..., dts=adaptive(...))` each number may be an array (B,), one value for each member.
@@ -79,10 +79,10 @@ def adaptive(
         verify: True: run again with every step halved, and report `run.error`, the error of the whole run at each of
             `times`, for three times the solves. `check()` then fails where it exceeds 10 (atol + rtol max|q|). This is
             a false alarm if the motion jumps, as in relaxation oscillations, at times that differ by more than a step
-            between the runs; "tolerance" instead runs again with a quarter of the tolerance. "tighten" continues from
-            there, with ever smaller tolerances, `run.steps.tightened` times the given ones, until the error of the run,
-            compared with the previous run, is below the tolerance itself at each of `times`. `check()` fails if this is
-            never reached.
+            between the runs. For such motions use "tolerance": it runs again with a quarter of the tolerance instead.
+            "tighten" continues from there with ever smaller tolerances, `run.steps.tightened` times the given ones. It
+            ends when the error of the run, compared with the previous run, is below the tolerance itself at each of
+            `times`. `check()` fails if this is never reached.
 
     Returns:
         An `Adaptive`.

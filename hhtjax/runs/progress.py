@@ -1,6 +1,6 @@
-"""What is shown of progress on stderr: a bar of tqdm where it is installed, else a line that is rewritten.
+"""Progress on stderr: a bar of tqdm if it is installed, otherwise one line that is overwritten.
 
-A run is drawn between blocks of steps, so that the steps of a block stay one kernel.
+The bar of a run is drawn between blocks of steps, so that the steps of a block stay one kernel.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from jax import lax
 from hhtjax.description import Array
 from hhtjax.description.presentation import overwrite
 
-MOST = 100  # times that a bar is drawn in a run
-LEAST = 30_000  # steps between two, of one unknown: 1.5 ms, where to draw takes .15 ms
-WIDTH, SHORTEST, LONGEST = 76, 10, 30  # characters of a line without brackets, and of its bar
-FORMAT = "{percentage:3.0f} %|{bar}| {desc}"  # of a bar of tqdm
+MOST = 100  # times that a bar is drawn in a run, about
+LEAST = 30_000  # steps between two drawings, with one unknown: they take 1.5 ms, a drawing 0.15 ms
+WIDTH, SHORTEST, LONGEST = 76, 10, 30  # characters: of the line without brackets, and limits of the bar in it
+FORMAT = "{percentage:3.0f} %|{bar}| {desc}"  # format of a tqdm bar
 
 # ----------------------------------------------------------------------------
-# The line, one in a process, as there is one terminal.
+# The line. A process has only one, because it has one terminal.
 
 
 class _Line:
-    """The line of one call, from what is done when it is first drawn. total: None where nobody knows it."""
+    """The line of one call. done: the work done when it is first drawn; total: None if it is unknown."""
 
     def __init__(self, done: int, total: int | None):
         self.first = self.done = done
         self.total, self.begun = total, time.monotonic()
-        self.paced: tuple[float, int] | None = None  # when, and how much was done, from where on the pace counts
+        self.paced: tuple[float, int] | None = None  # time and work done from which the pace is measured
         self.bar: Any = None
 
     def goes_on(self, done: int, total: int | None) -> bool:
-        """Whether this comes of the same call: one that was interrupted has left its line."""
+        """Whether this drawing belongs to the same call. A call that was interrupted leaves its line behind."""
         return total == self.total and not done <= self.first < self.done
 
     def draw(self, text: str, done: int, last: bool):
-        """The line with a text, and the times that have passed and are left."""
+        """Draws the line: a text, the elapsed time and the remaining time."""
         text += self.times(done, last)
         if self.bar is None and (tqdm := _tqdm()) is not None:
             self.bar = tqdm(total=self.total, initial=done, desc=text, bar_format=FORMAT if self.total else "{desc}")
@@ -50,12 +50,13 @@ class _Line:
             overwrite(self.in_characters(text), last)
             return
         self.bar.n = done
-        self.bar.set_description_str(text)  # which draws
+        self.bar.set_description_str(text)  # this draws the bar
         if last:
             self.bar.close()
 
     def times(self, done: int, last: bool) -> str:
-        """In words. What comes first may be compiled, and tells nothing of how long the rest takes."""
+        """The elapsed and the remaining time, in words. The first part of the work is left out of the pace, because it
+        may include compilation."""
         now = time.monotonic()
         words = f", {_in_words(now - self.begun)}" if now - self.begun >= 1 else ""
         if self.paced is None:
@@ -66,25 +67,25 @@ class _Line:
         return words
 
     def in_characters(self, text: str) -> str:
-        """The bar and a text."""
+        """The bar in characters, and a text."""
         if self.total is None:
             return text
         length = min(LONGEST, max(SHORTEST, WIDTH - len(text)))
         return f"[{'#' * (self.done * length // self.total):<{length}}] {text}"
 
     def drop(self):
-        """Without a trace, where another one takes its place."""
+        """Removes the line, because another one takes its place."""
         if self.bar is not None:
             self.bar.leave = False
             self.bar.close()
 
 
 _line: _Line | None = None
-_lock = threading.RLock()  # callbacks come from threads of JAX
+_lock = threading.RLock()  # callbacks run in threads of JAX
 
 
 def rewrite(text: str, last: bool, done: int = 0, total: int | None = None):
-    """The line with a text, and so much of a total done; the last one stays."""
+    """Rewrites the line: a text, and how much of the total is done. With `last` the line stays."""
     global _line
     with _lock:
         if _line is not None and not _line.goes_on(done, total):
@@ -97,7 +98,7 @@ def rewrite(text: str, last: bool, done: int = 0, total: int | None = None):
 
 
 def _tqdm() -> Any:
-    """The class of bars for where we are, or None."""
+    """The class of tqdm bars for a terminal or a notebook; None without tqdm."""
     try:
         from tqdm.auto import tqdm
     except ImportError:
@@ -106,23 +107,23 @@ def _tqdm() -> Any:
 
 
 def _in_words(seconds: float) -> str:
-    """A time to two digits or so."""
+    """A time in words, to about two digits."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 # ----------------------------------------------------------------------------
-# What is shown of calls that go from one thing to the next, in Python.
+# Progress of calls that do one part after the other, in Python.
 
 
 def bar(count: int, total: int, what: str):
-    """So many of all are done."""
+    """Draws that `count` of `total` are done."""
     rewrite(f"{what} {count} of {total}", count == total, count, total)
 
 
 def counted(chunks: Sequence[int], progress: bool) -> Iterator[int]:
-    """The chunks, one after the other, with a bar of those that are done."""
+    """Yields the chunks one after the other, and draws a bar of those that are done."""
     for done, k in enumerate(chunks):
         if progress:
             bar(done, len(chunks), "chunk")
@@ -133,9 +134,10 @@ def counted(chunks: Sequence[int], progress: bool) -> Iterator[int]:
 
 @contextmanager
 def stages(caller: str, progress: bool, total: int | None = None) -> Iterator[Callable[..., None]]:
-    """tell(what, work), which says what the call does next; without `progress` it says nothing.
+    """A context with a function tell(what, work) that shows what the call does next. Without `progress` it shows
+    nothing.
 
-    The last one stays, also where an error ends the call. total: of all work, None where nobody knows how long it is.
+    The last line stays, also if an error ends the call. total: the sum of all work; None if it is unknown.
     """
     done, ahead, text = 0, 0, ""
 
@@ -154,35 +156,37 @@ def stages(caller: str, progress: bool, total: int | None = None) -> Iterator[Ca
 
 
 # ----------------------------------------------------------------------------
-# What is shown of programs, from within them.
+# Progress of compiled programs, drawn from within them.
 
 
 def announce():
-    """Says on the line of the bar that a program is being compiled: called while it is traced, so only then."""
+    """Shows on the line of the bar that a program is being compiled. Call it during tracing: then it is shown only if
+    the program is compiled."""
     rewrite("compiling ...", last=False)
 
 
 def show_progress(count: Array, total: int, what: str):
-    """A bar, drawn about a hundred times in a run."""
+    """Draws a bar about a hundred times in a run."""
     every = max(1, total // MOST)
     lax.cond((count % every == 0) | (count == total), lambda: draw(count, total, what), lambda: None)
 
 
 def draw(count: Array, total: int, what: str):
-    """The bar itself."""
+    """Draws the bar by a callback."""
 
     jax.debug.callback(lambda count: bar(int(count), total, what), count)
 
 
 def steps_between(total: int, unknowns: int) -> int:
-    """How many steps lie between two drawings, so that these take little: a step of n takes n^2 at least."""
+    """Number of steps between two drawings, so that drawing takes little time. The time of a step of n unknowns is
+    assumed to be proportional to n^2."""
     return min(total, max(total // MOST, LEAST // unknowns**2, 1))
 
 
 def in_blocks(scan: Callable, carry: tuple, length: int, least: int, show: Callable):
-    """scan(carry, length), in blocks of `least` iterations or some more, with show(number of iterations) after each.
+    """As scan(carry, length), in blocks of at least `least` iterations, with show(number of iterations) after each.
 
-    scan: carry, number of iterations -> carry, what they return, stacked.
+    scan: carry, number of iterations -> carry, the stacked results of the iterations.
     """
     size = next((n for n in range(least, min(4 * least, length) + 1) if length % n == 0), least)
     blocks, rest = divmod(length, size)

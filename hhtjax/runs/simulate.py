@@ -106,8 +106,8 @@ def simulate(
         progress: shows a progress bar in one line on stderr, also under jit. A reverse derivative shows one for each
             pass.
         extrapolate: number of runs for Richardson extrapolation, 1 to 4, with steps dt, dt/2, dt/4, ... and the same
-            saved times. For a stepper of order p, 2 removes the error of order dt^p for three times the work; 3 also
-            removes that of order dt^(p + 1), for seven times the work. `hht` then has order 3 and 4. (alpha = 0 has
+            saved times. For a stepper of order p, 2 runs remove the error of order dt^p for three times the work; 3
+            also remove that of order dt^(p + 1), for seven times the work. `hht` then has order 3 or 4. (alpha = 0 has
             order 4 with 2 already, but order 3 with rotations unless kinematics="lie". With uneven steps only alpha = 0
             gains, to order 3.) Use it for motions that dt resolves; elsewhere it increases errors. Steps must be
             smooth, as with linearize="predictor". An error dt^3 remains where "auto" changes its choice, or where a
@@ -115,8 +115,9 @@ def simulate(
             the shortest steps. So is everything at a saved time that lies after an event in some of the runs only.
         t0: time of the start.
         events: a list of `Event`: impacts, end stops, switches, ends of the run. Each is located within the step in
-            which it happens, or given at a known time; the time grid does not change. A step without an event only
-            costs an evaluation of the guards more. For the `hht` family, Rosenbrock and Runge-Kutta methods.
+            which it happens, or given at a known time; the time grid does not change. A step without an event costs
+            one more evaluation of the guards. Supported by the `hht` family, Rosenbrock and Runge-Kutta methods and
+            `taylor`.
         max_events: largest number of events with a reset or switch in one step; with more the run fails. With
             `adaptive`, steps are shortened first, and the remainder of a step after an event has its own error
             estimate.
@@ -126,8 +127,8 @@ def simulate(
             It returns a pytree of arrays, which is saved as `run.output` instead of q, v and everything else. A long
             run of a large system then needs little memory. `check` works as before. Quantities that the system does not
             have are None. For a first-order system q is y and v its rate. params are those valid at the time, after
-            switches of events and with held inputs. Richardson extrapolation is applied to each number of the output;
-            do not return rotations unless entrywise extrapolation is what you want. `verify` compares q at the samples,
+            switches of events and with held inputs. Richardson extrapolation is applied to each number of the output,
+            so do not return rotations with it: the result would not be orthogonal. `verify` compares q at the samples,
             which it keeps during the run.
         throw: whether a failed run raises an error; otherwise it gives a `FailedRunWarning`. Both say what
             `solution.check()` says. Neither works inside jit and vmap: call `check()` on the result there.
@@ -162,7 +163,7 @@ def simulate(
     >>> [round(float(q), 4) for q in solution.q[:, 0]]                       # cos(2 t)
     [1.0, 0.8776, 0.5403, 0.0707, -0.4161]
 
-    What a sensor shows at given times, and nothing else:
+    Saving only what a sensor shows at given times:
 
     >>> solution = hhtjax.simulate(
     ...     spring, hhtjax.hht(), jnp.array([1.0]), jnp.array([0.0]), {"k": 4.0}, dt=1e-3, times=[0.25, 0.6, 1.0],
@@ -350,10 +351,10 @@ def _with_bar(
 
 
 # ----------------------------------------------------------------------------
-# What short runs of one linear system, in a scan of the user's, have in common: factorised once, where it is written.
+# Short runs of one linear system in a scan of the user's have the same factors. They are computed once, before it.
 #
-# XLA takes what does not change out of a loop, but not where all that does not change is constant: there each run
-# factorised its matrices.
+# XLA moves computations that do not change out of a loop, but not those that consist of constants only. So without this
+# each run would factorise its matrices.
 
 
 def known_factors(problem: Problem, dt: Real):

@@ -37,13 +37,14 @@ class ContactForces(NamedTuple):
     """Forces and states of contacts at the saved times.
 
     Attributes:
-        normal: (K + 1, m), normal forces, N, positive where they press the bodies apart; 0 where they do not touch.
-        friction: (K + 1, m), forces along the surfaces, positive if they oppose negative sliding.
+        normal: (K + 1, m), normal forces in N, positive where they press the bodies apart; 0 where they do not touch.
+        friction: (K + 1, m), forces along the surfaces, positive in the direction of positive `sliding`.
         closed: (K + 1, m), whether the bodies touch.
         sticking: (K + 1, m), whether they also stick; always False without friction.
         impacts: (K + 1, m), number of impacts so far.
-        rests_since: (K + 1, m), the time since which a closed contact has been closed, s; -inf: since the start; inf:
-            it is open. After bouncing it is the time at which the infinite sequence of bounces would have ended.
+        rests_since: (K + 1, m), the time at which a contact closed for the last time, in s; -inf: it has been closed
+            since the start; inf: it is open. After bouncing it is the time at which the infinite sequence of bounces
+            would have ended.
     """
 
     normal: Array
@@ -70,13 +71,14 @@ class Failure(NamedTuple):
     Attributes:
         step: its number, from 1; 0 if no step failed.
         newton: whether Newton's iteration failed while the state was still finite.
-        quantity: number of the first quantity that is not finite.
+        quantity: number of the first quantity that is not finite: 0 q, 1 v, 2 acceleration, 3 multipliers, 4 z, 5 zdot.
         row: index of the first constraint row that became dependent on the rows before it, -1 if none did; None without
             constraints.
         solve: the relative residual of the linear solve if it was too large, else 0; None for the library's own solve.
         friction: `info.friction` if it was too large, else 0; None without dry friction.
         mass: what is wrong at the start with a mass that is a function: 0 nothing, 1 it is not symmetric, 2 not
-            positive definite (with constraints: not positive semidefinite); None if the mass is constant.
+            positive definite (with constraints: not positive semidefinite), 3 it depends on velocities (only for
+            `from_lagrangian`); None if the mass is constant.
         event: what went wrong at an event, 0 nothing; None without events. guard: the number of that event.
         contact: `info.contact`, what went wrong with contacts, 0 nothing; None without contacts.
     """
@@ -140,7 +142,7 @@ WAYS = {
     INDEFINITE: f". {MASSLESS}",
     OF_VELOCITY: ": from_lagrangian needs a kinetic energy quadratic in v. For others write a System(mass, force)",
 }
-INTERNAL_STATE = 4  # among them
+INTERNAL_STATE = 4  # the index of z in QUANTITIES
 
 
 @shown
@@ -161,7 +163,7 @@ class Solution(NamedTuple):
         contact: `ContactForces`; None without contacts.
         steps: the steps that error control chose, a `Steps`; dt then holds the accepted ones. None without error
             control.
-        error: (K + 1,), the error of q at each saved time, in its largest coordinate, for a run with
+        error: (K + 1,), the error of q at each saved time, in the coordinate where it is largest; None without
             `adaptive(verify=)`.
         failed: whether the run failed, a property; (B,) for a batch: which members failed.
         allowed: the largest `error` that `check` accepts, 10 (rtol max|q| + atol); a tenth of that with
@@ -287,7 +289,7 @@ class Solution(NamedTuple):
         if not fitting or not t.size or dt.shape[: t.ndim - 1] != runs or dt.ndim > t.ndim:
             return f"t {brief(self.t)}"
         if self.steps is not None and np.isfinite(dt).any():
-            dt = dt[np.isfinite(dt)]  # behind the steps of a member is nothing
+            dt = dt[np.isfinite(dt)]  # NaN after the last step of a member
         batch = f"{failed[0].size} runs {runs}, each of " if runs else ""
         fault = self._fault()
         verdict = "every step finite" if fault is None else fault.partition(". ")[0].removesuffix(".")
@@ -408,7 +410,7 @@ def told(caller: str, solution: Solution, throw: bool) -> Solution:
 
 
 # ----------------------------------------------------------------------------
-# What was wrong with the times and the step sizes of a run, in words: what was traced is not known before.
+# Messages for wrong times and step sizes of a run. Traced values are only known after it.
 
 
 ORDER = "`times` must increase, and lie after t0; with t0 in front they were {}."
@@ -451,10 +453,10 @@ def bad_steps(t: np.ndarray, dt: np.ndarray, has_events: bool):
 
 
 # ----------------------------------------------------------------------------
-# What a run tells of its events.
+# The events of a run.
 
 
-WHOLE = 65  # numbers, at least: an array of fewer would be taken to pieces
+WHOLE = 65  # the least size of an array of the log: a kernel splits smaller arrays into scalars
 
 
 @shown
@@ -533,7 +535,7 @@ def row_of(t: Array, which: Array, rate: Array, q: Array, before: Array, after: 
 
 
 # ----------------------------------------------------------------------------
-# What may go wrong at an event, as data and in words.
+# Failures at an event: their codes and messages.
 
 
 FINE, MANY, STAYS, ALONG, CORNER, DIFFER, NO_NUMBER, NEGATIVE, THROWN, SINGULAR = range(10)

@@ -86,10 +86,10 @@ def sweep(
             on all devices: call `jax.device_get` before combining them with other arrays.
         progress: shows a progress bar in one line on stderr, also under jit. A reverse derivative shows one for each
             pass.
-        output: that of `simulate`: a function whose values are saved instead of q, v and everything else. A large sweep
+        output: as for `simulate`: a function whose values are saved instead of q, v and everything else. A large sweep
             then needs little memory, and little disk space with `sweep_to_disk`.
-        events, max_events, keep_events: those of `simulate`. A block only does the work of an event in steps in which
-            one of its members has one, so events cost a batch little.
+        events, max_events, keep_events: as for `simulate`. A block does the work of an event only in steps in which
+            one of its members has one, so events add little time to a sweep.
         throw: as for `simulate`; the first member that failed is named.
 
     Returns:
@@ -149,7 +149,7 @@ def sweep(
         runs = partial(run_sweep, **keywords)
         if events is None or keywords["lanes"] <= VECTORS:
             return told("sweep", runs(*arguments), throw)
-        # derivatives keep many states, of so many members more than a cache holds
+        # derivatives store many states; those of so many members do not fit into a cache
         found = derivative_by(partial(runs, lanes=VECTORS), runs, *arguments)
         return told("sweep", found, throw)
 
@@ -218,7 +218,7 @@ def run_sweep(
 
 
 def _together(member: Callable, axes: list, mine: list, dts: Array, substeps: Array) -> Solution:
-    """The members of a block; a batch of one would be slower, and would have to be ready to rest."""
+    """The members of a block. A single member is not batched: a batch of one would be slower, and could rest."""
     if len(dts) > 1:
         return jax.vmap(member, (axes, 0, 0, None))(mine, dts, substeps, jnp.max(substeps, axis=0))
     alone = [x if axis is None else x[0] for x, axis in zip(mine, axes, strict=True)]
@@ -234,7 +234,7 @@ def _by_many(hand, mesh):
 
 
 # ----------------------------------------------------------------------------
-# One member of a sweep: as many steps as it takes, and then at rest, as long as its block works.
+# One member of a sweep: it takes its own steps, then rests until the longest member of its block is done.
 
 
 def run_member(
@@ -252,10 +252,11 @@ def run_member(
     grows: bool = False,
     caller: str = "sweep",
 ) -> Solution:
-    """One member; it rests from `substeps` to `longest`, where its block still works.
+    """One member. After `substeps` steps it rests until `longest`, the number of steps of its block.
 
-    With `times`, start included, dt, substeps and longest are (K,), and the step is bound anew in each interval, and
-    after the first step there, where that is to know of the steps before. grows: of `resized_step`.
+    With `times`, start included, dt, substeps and longest are (K,). The step is then bound anew in each interval, and
+    again after the first step of an interval if the method needs the size of the step before. grows: as for
+    `resized_step`.
     """
     stepper, q0, v0, params, z0 = data
     problem = Problem(system, stepper, q0, v0, params, t0, z0, output)
@@ -300,12 +301,12 @@ def _at_ends(run: Run, intervals: tuple, grows: bool):
 
 
 def _paces(run: Run, substeps: Array, longest: Array, grows: bool):
-    """The function of what the loop carries and an interval that gives the step, and how many the member takes, and its
-    block."""
+    """A function of the carry of the loop and an interval. It returns the step, the number of steps of the member, and
+    that of its block."""
     stepper, params, loop, form = run.problem.stepper, run.params, run.loop, run.form
 
     def stepped(step_for: Callable, sizes: Callable):
-        """The step, with events one that rests."""
+        """The step; with events one that can rest."""
         return form.of(step_for(params) if loop.past is None else loop.past(step_for, sizes))
 
     def pace(before: tuple, interval: tuple | None):
@@ -344,7 +345,8 @@ def advance_from(
 
 
 def in_two_parts(t: Array, dt: Array, substeps: Array, longest: Array):
-    """The intervals (K, 2), the first step of each apart; behind them the steps before it, and the size of the last."""
+    """The intervals (K, 2), divided into the first step and the others; then the number of steps before each part, and
+    the size of the last step before it."""
     last = jnp.concatenate([dt[:1], dt[:-1]])
     firsts = t, dt, jnp.ones_like(substeps), jnp.ones_like(longest), jnp.zeros_like(substeps), last
     others = t, dt, substeps - 1, longest - 1, jnp.ones_like(substeps), dt

@@ -7,14 +7,14 @@ stepper                            order                 solves per step   for
                                                                            sets the point of linearisation
 `hht(alpha, iterations=None)`      2                     Newton's          the converged method, differentiated
                                                                            implicitly
-`newmark(beta, gamma)`             2; 1 for gamma > 1/2  1, or Newton's    origin of the family, same options
+`newmark(beta, gamma)`             2; 1 for gamma > 1/2  1, or Newton's    the oldest of the family, same options
 `bossak(alpha)`                    2                     1, or Newton's    same family, same options
 `generalized_alpha(rho_inf)`       2                     1, or Newton's    same family, same options
-`kim_hht(alpha)`                   1; 2 for alpha = 0    1                 the paper of 2019, literally
-`conventional_hht(alpha)`          1; 2 for alpha = 0    Newton's          its comparison, literally
-`kim_implicit_euler()`             1                     1                 its comparison, literally
+`kim_hht(alpha)`                   1; 2 for alpha = 0    1                 Kim et al. (2019), as printed
+`conventional_hht(alpha)`          1; 2 for alpha = 0    Newton's          a comparison in that paper
+`kim_implicit_euler()`             1                     1                 a comparison in that paper
 `rosenbrock(rho_inf=0)`            2                     2                 one factorisation; L-stable
-`rowda()`                          3                     4                 one factorisation; L-stable: for accuracy
+`rowda()`                          3                     4                 one factorisation; L-stable; accurate
 `rodas5p()`                        5                     8                 six digits or more, stiff, with a
                                                                            tolerance, `adaptive`
 `extrapolated()`                   5                     15                six digits or more, stiff, with constraints
@@ -100,7 +100,7 @@ v and w, and `system.move` leaves them out. A method that supports them sets `so
 >>> abs(float(run.q[-1, 0] - jnp.cos(10.0))) < 5e-3
 True
 
-A method whose state depends on the size of the last step also has a `resized`, as in `variable_step.py`.
+A method whose state depends on the size of the last step also needs a method `resized`, as in `variable_step.py`.
 
 An explicit Runge-Kutta method is defined by its coefficients, an `ExplicitTableau`, and a Rosenbrock method by a
 `RosenbrockTableau`. With coefficients for an error estimate and for dense output, all runs and gradients work as with
@@ -116,8 +116,8 @@ A method of the generalised-alpha kind only needs another set of coefficients, o
 `implicit_euler`. Add a new method to `STEPPERS` in `tests/zoo.py`: its order, derivatives, dtypes, batches and error
 messages are then tested on the problems there. Test its own features against a closed form.
 
-For error control, `simulate(..., dt=adaptive(...))`, a method also has an `estimate_order` k, a `begin_estimates`, and
-a `bind_estimated`, whose step also returns the errors, of size h^k (`variable_step.py`).
+For error control, `simulate(..., dt=adaptive(...))`, a method also needs an `estimate_order` k, a `begin_estimates`,
+and a `bind_estimated`, whose step also returns the errors, of size h^k (`variable_step.py`).
 
 Sources
 -------

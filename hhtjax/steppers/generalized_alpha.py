@@ -47,9 +47,9 @@ if TYPE_CHECKING:
 def step(
     method: GeneralizedAlpha, system: FlatSystem, params: PyTree, factorize: Any, where: str | None, dt: Real, s: State
 ) -> tuple[State, Info]:
-    """From s to t + dt by one Newton step from the constant-acceleration predictor: one Jacobian, one solve.
+    """One step from s to t + dt: by default one Newton step from the predictor, with one Jacobian and one solve.
 
-    Or by as many as `iterations` says; None: by the converged method.
+    With `iterations` k it takes k Newton steps; with None it iterates until `tolerance`.
     """
     options, r = method.options, partial(residual, system, params)
     path = partial(method.arrive, system, s, dt)  # the state at t + dt, given its acceleration
@@ -74,7 +74,7 @@ class GeneralizedAlpha(Controlled, Stepper):
     coefficients: Coefficients
     order: int
     options: Options
-    estimating: bool = False  # whether steps tell their defect
+    estimating: bool = False  # whether steps return their defect, for error control
 
     solves_constraints = True
     solves_rotations = True
@@ -110,7 +110,7 @@ class GeneralizedAlpha(Controlled, Stepper):
         resolves: bool = False,
         alone: bool = False,
     ) -> State:
-        """The state from which the first step goes, by `start`."""
+        """The state from which the first step starts, as `start` says."""
         if self.options.start == "simple" or not system.positions or (resolves and not self.corrects(system)):
             return state
         if system.contact is not None:
@@ -122,7 +122,7 @@ class GeneralizedAlpha(Controlled, Stepper):
     def jumped(
         self, system: FlatSystem, before: State, after: State, old: PyTree, new: PyTree, dt: Array, answer: Callable
     ) -> State:
-        """`after`, the state where held inputs jump; smooth, where what damps is too stiff for dt."""
+        """The state `after` a jump of held inputs; with a smooth start where damping is too stiff for dt."""
         if system.contact is not None:
             return jumped_contact(self, self.seen(system, new, before.q.dtype), before, new, dt)
         if self.options.start == "simple" or not system.positions:
@@ -137,12 +137,12 @@ class GeneralizedAlpha(Controlled, Stepper):
         return jumped(self, system, before, after, (old, new), dt, answer, anew)
 
     def grown(self, system: FlatSystem, state: State, params: PyTree, dt: Array) -> State:
-        """The state, or where what damps is too stiff for dt a smooth start from it."""
+        """The state, with a smooth start where damping is too stiff for dt."""
         smooth = smoothed if system.friction is None else smoothed_friction
         return grown(self, self.seen(system, params, state.q.dtype), state, params, dt, smooth)
 
     def throws(self, system: FlatSystem) -> bool:
-        """Unless there are no positions, or the recursion is to be literal."""
+        """True unless there are no positions, or `start` is "simple"."""
         return self.options.start != "simple" and system.positions > 0
 
     @property
@@ -151,14 +151,14 @@ class GeneralizedAlpha(Controlled, Stepper):
         return self.options.start != "simple"
 
     def corrects(self, system: FlatSystem) -> bool:
-        """Whether a0 has the term of second order."""
+        """Whether a0 is the second-order value."""
         start = self.options.start
         return self.resizes and (start == "corrected" or (start is None and system.num_constraints > 0))
 
     def corrected(self, system: FlatSystem, v: Array, w: Array, wdot: Array, dt: Array) -> Array:
-        """a0 of second order: w0 + (alpha_m - alpha_f) h times the rate of psiddot, or of v.
+        """a0 of second order: w0 + (alpha_m - alpha_f) h dw/dt; for charts with the second derivative of psi as w.
 
-        Internal states may be far faster than h, and keep their w0.
+        Internal states may be far faster than h, so they keep their w0.
         """
         if self.options.kinematics == "chart" and system.blocks:
             wdot = system.with_internal(kinematics.chart_jerk(system.blocks, *map(system.located, (v, w, wdot))), wdot)
@@ -196,7 +196,7 @@ class GeneralizedAlpha(Controlled, Stepper):
         return self.options.redundant
 
     def factorize_for(self, system: FlatSystem):
-        """The same for constrained systems, whose rows may be redundant."""
+        """As `factorize`, for constrained systems, whose rows may be redundant."""
         if system.sparse is not None:
             return system.sparse
         if isinstance(self.options.solve, Structured):
@@ -218,7 +218,7 @@ class GeneralizedAlpha(Controlled, Stepper):
         return State(s.t + dt, system.move(s.q, x), *rates)
 
     def factorization(self, system: FlatSystem, params: PyTree, dt: Array):
-        """What the matrix of a step is factorised by; that of a linear system is so here, once."""
+        """The function that factorises the matrix of a step; for a linear system it is factorised here, once."""
         if system.num_constraints:
             return self.factorize_for(system)
         if system.linear and system.friction is None:
@@ -226,7 +226,7 @@ class GeneralizedAlpha(Controlled, Stepper):
         return linear_part(self, system, params, dt) or system.sparse or self.factorize
 
     def factors_of(self, system: FlatSystem, dt: Array):
-        """The `Factors` of a linear system of constant matrices, for those who make them once for many runs."""
+        """The `Factors` of a linear system with constant matrices, for callers that compute them once for many runs."""
         return factors_of(self, at_start(self), system, dt)
 
     def bind(self, system: FlatSystem, params: PyTree, dt: Array):
@@ -238,7 +238,7 @@ class GeneralizedAlpha(Controlled, Stepper):
             return bind_friction(self, system, params, dt, linear_part(self, system, params, dt))
         if system.num_constraints:
             return bind_constrained(self, system, params, dt)
-        where = "predictor" if system.linear else self.options.linearize  # all points of linearisation are one
+        where = "predictor" if system.linear else self.options.linearize  # linear: every point gives the same
         return partial(step, self, system, params, self.factorization(system, params, dt), where, dt)
 
 
@@ -256,13 +256,13 @@ def hht(alpha: Real = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
         iterations: 1: non-iterative; k: that many Newton iterations; None: Newton until `tolerance`.
         linearize: the point about which the first solve linearises M w - Q at t1.
             "predictor": q, v for constant acceleration. Smooth in all arguments. Use it for fitting, and for steps that
-                resolve the motion. The first to fail at large steps: on stiffening springs, nonlinear dampers, chaotic
-                links.
-            "held": q + h v, with v as it is at t. Smooth, and bounded most often, but 1.5 to 1.7 times the error on
-                average.
+                resolve the motion. It is the first to fail at large steps: on stiffening springs, nonlinear dampers,
+                chaotic links.
+            "held": q + h v, with the v at t. Smooth. It stays bounded most often, but its error is 1.5 to 1.7 times as
+                large on average.
             "state": (q, v, w) at t; the acceleration is then recomputed from M w1 = Q1 (Kim's step made second order).
-                Best with nonlinear dampers. It loses two digits on a stiff slow manifold, fails at contacts, and needs
-                a second factorisation, that of M.
+                Best with nonlinear dampers. It loses two digits on the slow motion of stiff systems, fails at contacts,
+                and needs a second factorisation, that of M.
             "auto": "predictor", or "held" where the predictor's residual is not negligible and the residual of "held"
                 is smaller; such a step has a second solve. The result jumps by O(h^3) where the choice changes.
             Default: "auto" for one iteration, "predictor" for more. Over 14 scenes, 10 steps and 3 alphas, auto stayed
@@ -276,24 +276,24 @@ def hht(alpha: Real = -0.05, **options: Unpack[Keywords]) -> GeneralizedAlpha:
             "smooth": components of the velocity whose damping is too stiff for h first take an implicit step, and the
                 acceleration is corrected with the matrix of the step. Motion that h resolves changes by O(h^5) only.
                 Without this, a light, strongly damped coordinate that does not start with the velocity its forces
-                demand is thrown by h^2 M^-1 Q (1/2 - beta/gamma), which can be any multiple of its correct
+                demand is displaced by h^2 M^-1 Q (1/2 - beta/gamma), which can be any multiple of its correct
                 displacement. `run.v[0]` is still the given v0.
-            "corrected": as "smooth", and a0 = w0 + (alpha_m - alpha_f) h dw/dt, the second-order value. q, v and w have
-                order 2 without it; a and multipliers need it.
+            "corrected": as "smooth", and the algorithmic acceleration a starts from its second-order value,
+                a0 = w0 + (alpha_m - alpha_f) h dw/dt. q, v and w have order 2 without it; a and multipliers need it.
             "simple": a0 = w0 = M^-1 Q, the unmodified recursion.
             Default: "smooth"; with constraints "corrected". Internal states keep their rates.
-        formulation: of constraints. "ggl": enforces Phi = 0 and dPhi/dt = 0, with a second multiplier for each
-            constraint (Gear, Gupta, Leimkuhler 1985). "index3": enforces Phi = 0 only, an equation of index 3; rounding
-            errors of the multipliers, and of their derivatives, are amplified by 1/h^2. With constraints, as with dry
-            friction, the residual is linearised once, at the predictor.
+        formulation: how constraints are enforced. "ggl": enforces Phi = 0 and dPhi/dt = 0, with a second multiplier for
+            each constraint (Gear, Gupta, Leimkuhler 1985). "index3": enforces Phi = 0 only, an equation of index 3;
+            rounding errors of the multipliers, and of their derivatives, are amplified by 1/h^2. With constraints, as
+            with dry friction, the residual is linearised once, at the predictor.
         redundant: "least_squares" for constraints that depend on each other, always or in singular positions. It
             returns the smallest multipliers, by one singular value decomposition per solve. By default dependent
             constraints are an error at the start, and later a failure that `solution.check()` reports for the step in
-            which they become dependent. Needed also for directions of dry friction that may become dependent, if
+            which they become dependent. It is also needed for directions of dry friction that may become dependent, if
             neither their number nor the start shows it.
-        kinematics: of rotations. "chart": the recursion runs on the rotation vector of each step (Cardona, Geradin
-            1989, made second order). "lie": it runs on the angular velocity (Bruls, Cardona 2010). This is simpler and
-            of order 2 too, but has 4 to 5 times the error on a fast top.
+        kinematics: how rotations are integrated. "chart": the recursion runs on the rotation vector of each step
+            (Cardona, Geradin 1989, made second order). "lie": it runs on the angular velocity (Bruls, Cardona 2010).
+            This is simpler and of order 2 too, but has 4 to 5 times the error on a fast top.
         solve: `solve(A, b)` for A (n, n) and b (n,), instead of the library's LU. It need not be differentiable. For
             large systems use `banded(p)` or `conjugate_gradients(iterations)`. A relative residual above 1e-6 (1e-3 in
             float32; or the `tolerance` of these two) is a failure that `solution.check()` reports.
@@ -399,7 +399,7 @@ def generalized_alpha(rho_inf: Real = 0.8, **options: Unpack[Keywords]) -> Gener
 
 
 # ----------------------------------------------------------------------------
-# Fully implicit Euler: the generalised-alpha machinery with another update.
+# Fully implicit Euler: the generalised-alpha method with another update.
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,13 +415,13 @@ class ImplicitEuler(GeneralizedAlpha):
 def implicit_euler(
     iterations: int | None = None, tolerance: Real = 1e-10, max_iterations: int = 20, solve: Callable | None = None
 ) -> ImplicitEuler:
-    """Implicit Euler, v1 = v + h w1, q1 = q + h v1, M(q1) w1 = Q(q1, v1, t1), solved by Newton.
+    """Implicit Euler, v1 = v + h w1, q1 = q + h v1, M(q1) w1 = Q(q1, v1, t1), by Newton's iteration.
 
     Order 1, L-stable, strongly damping: a reference for robustness, not for accuracy. It supports constraints (GGL),
     rotations (in charts), internal states and dry friction, as `hht` does.
 
     Args:
-        iterations: None, Newton until `tolerance`; k, that many Newton iterations.
+        iterations: None: Newton until `tolerance`; k: that many Newton iterations.
         tolerance, max_iterations, solve: as in `hht`.
 
     Returns:

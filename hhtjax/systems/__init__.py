@@ -68,8 +68,8 @@ Inputs
 ------
 
 `sampled` turns a measured input, with samples at equal steps or at any `times`, into a function of time; put it into
-params. Use `band_limited` for samples that are hardly denser than their highest frequency; `spline_gain_error` tells
-whether you need it.
+params. If the samples are hardly denser than their highest frequency, use `band_limited`; `spline_gain_error` returns
+the error without it.
 
 >>> u = hhtjax.sampled(jnp.sin(jnp.linspace(0.0, 6.0, 61)), dt=0.1)                # a cubic spline through the samples
 >>> run = hhtjax.simulate(spring, hhtjax.hht(), q0, v0, {"k": 9.0, "u": u}, dt=1e-2, num_steps=600)
@@ -108,8 +108,8 @@ a closed gap is closed to rounding.
 
     M(q) w = Q + B^T L + J^T (f_N, f_T),    f_N >= 0,    f_N g = 0,    |f_T| <= mu f_N
 
-Example: a ball that bounces until it rests. It rests from sqrt(2 H/g) (1 + e)/(1 - e) on. This time includes infinitely
-many bounces; those shorter than a step are not computed:
+Example: a ball is dropped from the height H and bounces until it rests, from the time sqrt(2 H/g) (1 + e)/(1 - e) on.
+Infinitely many bounces come before this time; those shorter than a step are not computed:
 
 >>> floor = hhtjax.Contact(gap=lambda q, t, params: q[0], restitution="e")
 >>> ball = hhtjax.System(mass=jnp.ones(1), force=lambda q, v, t, params: 0 * q - 9.81, contact=floor)
@@ -120,8 +120,8 @@ many bounces; those shorter than a step are not computed:
 
 The `hht` family supports contact with steps of any sizes, M(q), constraints, rotations that keep the contact in its
 plane, internal states, inputs, `sweep` and `fit`. It has order 2 in q, v and the forces through all impacts and
-switches, and derivatives are those of the run. Not supported: more than four contacts, sliding in two directions, and
-restitution where a body collides with one that rests on others. Use MuJoCo for these. The page
+switches. Derivatives are those of the computed run. Not supported: more than four contacts, sliding in two directions,
+and restitution where a body collides with one that rests on others. Use MuJoCo for these. The page
 `experiments/contact/README.md` compares with other approaches.
 
 A stiff spring instead of contact needs far shorter steps. If they are too long it generates energy without a warning;
@@ -133,8 +133,9 @@ Internal states
 An internal state z has a rate but no position: zdot = g(q, v, z, t). Examples are hysteresis, the bristles of a
 friction model, the current of a motor, the integral of a controller, and a Maxwell branch. z is any pytree and follows
 q and v in argument lists. It is solved together with the motion, in the same factorisation and to the same order,
-however fast it is. The `hht` family, Rosenbrock methods and (unless z is fast) Runge-Kutta methods support it, with
-constraints, rotations, sweeps and gradients. Forces take z too.
+however fast it is. The `hht` family, `extrapolated` and Rosenbrock methods support it; unless z is fast, Runge-Kutta
+methods and `taylor` do, too. The `hht` family also combines it with constraints and rotations. Sweeps and gradients
+work. Forces take z too.
 
 >>> def torque(q, v, z, t, params):
 ...     return params["kt"] * z["current"] - 0.01 * v
@@ -159,8 +160,8 @@ Coordinates without mass
 A node between two springs, or between a spring and a damper, has no mass. Its acceleration does not follow from forces,
 and a singular mass is an error. If the forces on it depend on positions only, write their balance as a `constraint`; M
 may then be singular. Its multiplier is 0, since the balance needs no reaction. If a damper acts on it, the balance
-gives its velocity, and the node is an internal state. The example has a mass on two springs of 300 and 600 N/m in
-series, equal to one of 200 N/m; and a mass on a spring of 300 N/m in series with a damper of 50 N s/m.
+gives its velocity, and the node is an internal state. The first example is a mass on two springs of 300 and 600 N/m in
+series, which act like one of 200 N/m. The second is a mass on a spring of 300 N/m in series with a damper of 50 N s/m.
 
 >>> def springs(q, v, t, params):
 ...     node, end = q
@@ -188,8 +189,8 @@ smoothed: a sticking joint does not creep. The `hht` family solves the law with 
 2 in q, v and z through every switch, with M(q), constraints, rotations and internal states. Derivatives converge to
 those of the exact motion, so limits can be fitted. Choose a step that is short compared with the times during which a
 joint slides or sticks: if a single joint switches twice in one step, the second switch is delayed to the next step.
-Several joints are followed from switch to switch within the step, whether their inertia couples them or not, because
-the switch of one makes the acceleration of the others jump.
+With several joints, coupled by inertia or not, every switch within a step is computed, because the switch of one joint
+makes the acceleration of the others jump.
 
 >>> def force(q, v, t, params):
 ...     return -params["k"] * q + 6.0 * jnp.sin(2.0 * t)
@@ -206,13 +207,13 @@ Rolling, or gliding on a knife edge, is a velocity constraint, which `constraint
 that never slides: take the velocities that must be zero as `sliding`, with a limit larger than all forces. tau are then
 the constraint forces. The start must not slide.
 
-On a belt with speed u, `sliding=lambda q, v, t, params: v - params["u"]`; between two bodies it is the difference of
+On a belt with speed u, use `sliding=lambda q, v, t, params: v - params["u"]`; between two bodies, use the difference of
 their velocities. s must be affine in v. It has up to 16 rows, which may depend on each other and on constraints: all
 joints of a closed loop may have friction, or those of a mechanism whose crank is driven. The motion is then unique, but
-the forces at sticking joints are not; `System` says which are returned. A limit in a system with internal states is
-called as limit(q, v, z, t, params), with a constraint as limit(q, v, L, t, params). F must be continuous: write a jump
-from stiction to sliding as a steep Stribeck curve. Between saved times `interpolate` has only order 2 where a joint
-switches. `energy_balance` accounts for the energy that friction dissipates and that a belt supplies.
+the forces at sticking joints are not; the docstring of `System` says which ones are returned. With internal states the
+limit is called as limit(q, v, z, t, params), with a constraint as limit(q, v, L, t, params). F must be continuous:
+write a jump from stiction to sliding as a steep Stribeck curve. Between saved times `interpolate` has only order 2
+where a joint switches. `energy_balance` accounts for the energy that friction dissipates and that a belt supplies.
 
 Many unknowns
 -------------
@@ -245,11 +246,11 @@ It finds the couplings from the functions. It works with constraints, internal s
 Rotations
 ---------
 
-A leaf R (3, 3) of q, or several as (k, 3, 3), is a rotation from material (body-fixed) to spatial components. Its leaf
-of v, of shape (3,) or (k, 3), is the material angular velocity Om, with Rdot = R hat(Om). The `hht` family integrates
-it by rotation vectors (`kinematics="chart"`) or directly (`"lie"`). Both have second order for any inertia, and keep R
-orthogonal to rounding. `hhtjax.rotation` has the exponential, the logarithm, the tangent maps and their derivatives,
-which are correct at zero too.
+A leaf R (3, 3) of q, or several as (k, 3, 3), is a rotation from material (body-fixed) to spatial components. The same
+leaf of v, of shape (3,) or (k, 3), is the material angular velocity Om, with Rdot = R hat(Om). The `hht` family
+integrates it by rotation vectors (`kinematics="chart"`) or directly (`"lie"`). Both have second order for any inertia,
+and keep R orthogonal to rounding. `hhtjax.rotation` has the exponential, the logarithm, the tangent maps and their
+derivatives, which are correct at zero too.
 
 >>> def gyroscopic(R, Om, t, params):
 ...     return -jnp.cross(Om, params["J"] * Om)

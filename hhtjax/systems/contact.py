@@ -41,14 +41,14 @@ class Contact(Description):
     """Contacts of bodies in a plane, for `System(contact=)`: they collide, rest, stick, slide and separate.
 
     Args:
-        gap: g, `gap(q, t, params)` -> (m,), or a number: the distances, m, positive where bodies are apart; smooth. m
-            <= 4.
-        sliding: s, `sliding(q, v, t, params)` -> (m,), or a number: the velocities along the surfaces, m/s, affine in
+        gap: g, `gap(q, t, params)` -> (m,), or a number: the distances in metres, positive where bodies are apart. A
+            smooth function. At most m = 4 contacts.
+        sliding: s, `sliding(q, v, t, params)` -> (m,), or a number: the velocities along the surfaces in m/s, affine in
             v. The problem is planar: a contact slides along one line.
-        friction: mu >= 0, Coulomb's coefficient: a number, (m,), the name of one in params, or a function of params. It
-            needs `sliding`.
-        restitution: e in [0, 1], the ratio of the normal impulse of expansion to that of compression (Poisson); given
-            in the same forms as mu.
+        friction: mu >= 0, Coulomb's coefficient: a number, (m,), the name of an entry of params, or a function of
+            params. It needs `sliding`.
+        restitution: e in [0, 1], the ratio of the normal impulse of expansion to that of compression (Poisson); the
+            same types as mu.
 
     Supported by the `hht` family. A step is divided where a contact lands or switches between sticking, sliding and
     separation. q, v and the forces have order 2 through all switches, and gaps of closed contacts are 0 to rounding.
@@ -69,7 +69,7 @@ class Contact(Description):
 
     To add contact to an existing system, such as a mechanism, use `dataclasses.replace(system, contact=)`.
 
-    A block that slides 0.204 m, v^2/(2 mu g), and stays there:
+    Example: a block slides 0.204 m, v^2/(2 mu g), and stays there:
 
     >>> import jax.numpy as jnp, hhtjax
     >>> floor = hhtjax.Contact(gap=lambda q, t, params: q[1], sliding=lambda q, v, t, params: v[0], friction="mu")

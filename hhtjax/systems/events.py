@@ -36,37 +36,37 @@ class Event(Description):
 
     Args:
         guard: g, `guard(q, v, t, params)` -> a number, smooth, positive where the motion is allowed, negative beyond.
-            The event happens when g falls from positive to zero, not when it rises. For the other direction give -g;
-            for both, a mode that changes the sign, see `switch`. With internal states z follows v; for a
+            The event happens when g falls from positive to zero, not when it rises. For the other direction give -g.
+            For both directions let a mode change the sign, see `switch`. With internal states z follows v; for a
             `FirstOrderSystem` write guard(y, t, params). A further argument named `multipliers`, as in
-            `guard(q, v, t, params, multipliers)`, receives the multipliers L (m,) of the constraint. So a contact that
-            a constraint holds can end when its multiplier falls to zero.
+            `guard(q, v, t, params, multipliers)`, receives the multipliers L (m,) of the constraint. Use it to end a
+            contact described by a constraint when its multiplier falls to zero.
         reset: the velocity after the event, `reset(q, v, t, params)` -> a pytree like v; or `impact(restitution)`. For
-            a `FirstOrderSystem` the new y. Default: no change. q cannot change, it must be continuous.
+            a `FirstOrderSystem` the new y. Default: no change. q cannot change: it is continuous.
         switch: the params after the event, `switch(params)`, of the same structure, shapes and dtypes; or
             `switch(q, v, t, params)`, with the state before the event (arguments as for a guard). Use it for a force
             that jumps: let the force depend on a mode, a number in params, and not on a `where` of the position. A step
-            across such a `where` loses its order, and one that ends on it may be thrown back again and again. If the
-            event does not turn the motion back, the guard would stay negative after it: let the guard depend on the
-            mode.
-        terminal: whether the run ends there. State and time then stay as they are up to the end of the saved times.
+            across such a `where` loses its order, and at its edge the motion may be thrown back again and again. If the
+            event does not turn the motion back, the guard stays negative after it. The guard must then depend on the
+            mode, too.
+        terminal: whether the run ends there. All later saved times then repeat the time and the state of the event.
         at: the times at which the event happens, instead of a guard: a number, (K,) in increasing order, or
-            `at(params)` -> one of these, with the params of the start. Steps are divided there, and a run is
+            `at(params)` -> one of these, called with the params of the start. Steps are divided there, and a run is
             differentiable in the times. Times before t0 are ignored; one at t0 happens at the start of the first step.
 
     An event without reset, switch and terminal is only recorded and changes nothing. Use it for sections of a Poincare
     map, or times of passage. Of simultaneous events, recorded ones come first. The others happen one after the other if
-    none changes the rate of another's guard, as impacts of bodies that do not touch. Otherwise their order would
-    matter, and the run fails with a message.
+    none changes the rate of another's guard. Impacts of bodies that do not touch are an example. Otherwise their order
+    would matter, and the run fails with a message.
 
-    A guard may jump below zero because another event changes something, as -v does in a rebound. This is not a
-    crossing. An event that is only recorded does not happen then, as in a run of SciPy's that starts anew after the
-    other event; any other makes the run fail with a message. To record rebounds, use the guard of the impact. Only a
-    guard of multipliers may jump, because forces do, for example when a load is switched on; its event then happens at
-    once.
+    A guard may jump below zero because another event changes something. The guard -v, for example, jumps in a rebound.
+    This is not a crossing. An event that is only recorded then does not happen. (SciPy gives the same result if you
+    start a new run after the other event.) If the event is not only recorded, the run fails with a message. To record
+    rebounds, use the guard of the impact. Only a guard that reads multipliers may jump, because forces jump, for
+    example when a load is switched on; its event then happens at once.
 
-    For a guard of multipliers, L within a step is blended from linear interpolation and the values of a partial step.
-    Its time is as exact as the saved L, of order 2. Derivatives are those of the run, and of order 1.
+    For such a guard, L within a step is a blend of linear interpolation and the values of a partial step. The time of
+    the event has order 2, like the saved L. Its derivatives are those of the computed run, and have order 1.
 
     Events do not model resting contact. A ball that comes to rest on the floor bounces infinitely often in a finite
     time, and the run fails when more than `max_events` events fall into one step. For lasting contact use a `Contact`
@@ -86,7 +86,8 @@ class Event(Description):
     >>> int(run.events.count), round(float(run.events.t[0]), 6)                # sqrt(2/9.81)
     (1, 0.451524)
 
-    A load that is switched on at a given time, and the derivative of the final position in that time, -F (1 - time)/m:
+    Example: a load is switched on at a given time. The derivative of the final position with respect to that time is
+    -F (1 - time)/m:
 
     >>> import jax
     >>> body = hhtjax.System(mass=jnp.full(1, 2.0), force=lambda q, v, t, params: params["F"] + 0 * q)

@@ -1,11 +1,11 @@
-"""What other packages take: systems as diffrax terms or for SciPy's `solve_ivp`, runs as tables; `hhtjax.interop`.
+"""Conversions for other packages: systems for diffrax and SciPy's `solve_ivp`, runs as tables; `hhtjax.interop`.
 
-The second-order system becomes the first-order one of y = (q, v),
+A second-order system becomes a first-order system of y = (q, v):
 
     q' = v,    v' = w with M(q) w = Q(q, v, t);    with constraints  [M -B^T; B 0] [w; L] = [Q; -(rest of d2Phi/dt2)]
 
-that is, of index 1: solutions leave Phi = 0 by what the solver's errors add up to. A rotation R has R' = R hat(Om),
-and stays orthogonal to the accuracy of the solver. With internal states, y = (q, v, z).
+Constraints are thus reduced to index 1: the errors of the solver add up, and Phi drifts away from 0. A rotation R has
+R' = R hat(Om), and stays orthogonal to the accuracy of the solver. With internal states, y = (q, v, z).
 """
 
 from __future__ import annotations
@@ -49,19 +49,20 @@ __all__ = ["FlatODE", "ScipyRHS", "columns", "diffrax_term", "flat_ode", "ode", 
 
 
 def ode(system: AnySystem):
-    """The system as an ODE on pytrees: the function (t, y, params) -> y' of y = (q, v); of y itself for y' = f(y, t).
+    """The system as an ODE on pytrees: a function (t, y, params) -> y' with y = (q, v).
 
-    With internal states y = (q, v, z). Traceable and differentiable; of equal systems equal, also as a pytree.
+    With internal states y = (q, v, z); for a `FirstOrderSystem` it is the y of y' = f(y, t). The function can be traced
+    and differentiated. Equal systems give equal functions, also as pytrees.
 
     Args:
         system: a `System`, `LinearSystem` or `FirstOrderSystem`.
 
     Returns:
-        (t, y, params) -> y', structured like y, but with the rate of a rotation matrix (3, 3) in its place.
+        (t, y, params) -> y', structured like y. A rotation matrix (3, 3) in y has its rate, also (3, 3), in y'.
 
     Raises:
-        TypeError: what is no system; when called, a y that is no (q, v), or (q, v, z).
-        NotImplementedError: when called, dry friction, which is no function of the state.
+        TypeError: `system` is not a system; when called, y is not (q, v), or (q, v, z).
+        NotImplementedError: when called, dry friction or contact, whose forces are not functions of the state.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> pendulum = hhtjax.System(jnp.ones(1), lambda q, v, t, params: {"angle": -params["g"] * jnp.sin(q["angle"])})
@@ -76,12 +77,12 @@ def ode(system: AnySystem):
 
 @shown
 class FlatODE(NamedTuple):
-    """What `flat_ode` returns.
+    """Result of `flat_ode`.
 
     Attributes:
-        rate: (t, y, params) -> y' on vectors (N,), traceable.
+        rate: (t, y, params) -> y' on vectors (N,); can be traced.
         y0: (N,), the start.
-        unravel: y (N,) -> (q, v), or (q, v, z), pytrees; of a first-order system the pytree y.
+        unravel: y (N,) -> (q, v), or (q, v, z), pytrees; for a first-order system the pytree y.
     """
 
     rate: Any
@@ -90,7 +91,7 @@ class FlatODE(NamedTuple):
 
 
 def flat_ode(system: AnySystem, q0: PyTree, v0: PyTree = None, z0: PyTree = None) -> FlatODE:
-    """The same on vectors: y holds the numbers of q, then those of v, then z, each in the order of `ravel_pytree`.
+    """The system as an ODE on vectors: y has the numbers of q, then v, then z, each in the order of `ravel_pytree`.
 
     Args:
         system, q0, v0, z0: as in `simulate`.
@@ -99,8 +100,8 @@ def flat_ode(system: AnySystem, q0: PyTree, v0: PyTree = None, z0: PyTree = None
         A `FlatODE`.
 
     Raises:
-        TypeError, ValueError: as `simulate`, for these.
-        NotImplementedError: when `rate` is called, dry friction.
+        TypeError, ValueError: as `simulate`, for these arguments.
+        NotImplementedError: when `rate` is called, dry friction or contact.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> body = hhtjax.System(lambda R, params: params, lambda R, Om, t, params: -jnp.cross(Om, params * Om))
@@ -118,9 +119,9 @@ def flat_ode(system: AnySystem, q0: PyTree, v0: PyTree = None, z0: PyTree = None
 def diffrax_term(system: AnySystem):
     """The system as a `diffrax.ODETerm`, for `diffeqsolve(term, solver, t0, t1, dt0, y0=(q0, v0), args=params)`.
 
-    y0 is (q0, v0), pytrees, or (q0, v0, z0), or y0 of a `FirstOrderSystem`; args are the params, modules of equinox
-    among them. All that diffrax does with an ODE is there: step-size control, events, adjoints. Inputs that are held,
-    `sampled(order=0)`, jump: tell the step-size controller, `diffrax.ClipStepSizeController(..., jump_ts=)`.
+    y0 is (q0, v0), pytrees, or (q0, v0, z0), or the y0 of a `FirstOrderSystem`. args are the params, which may contain
+    modules of equinox. diffrax then offers all that it has for ODEs: step-size control, events, adjoints. Held inputs,
+    `sampled(order=0)`, jump. Pass the times of their jumps to `diffrax.ClipStepSizeController(..., jump_ts=)`.
 
     Args:
         system: a `System`, `LinearSystem` or `FirstOrderSystem`.
@@ -129,8 +130,8 @@ def diffrax_term(system: AnySystem):
         A `diffrax.ODETerm`.
 
     Raises:
-        TypeError: what is no system.
-        NotImplementedError: when called, dry friction.
+        TypeError: `system` is not a system.
+        NotImplementedError: when called, dry friction or contact.
         ImportError: diffrax is not installed; it comes with the extra "interop".
 
     >>> import diffrax, jax.numpy as jnp, hhtjax
@@ -151,9 +152,10 @@ class ScipyRHS(NamedTuple):
     """For `scipy.integrate.solve_ivp(fun, (t0, t1), y0, jac=jac)`; made by `scipy_rhs`.
 
     Attributes:
-        fun: (t, y) -> y', (N,), compiled, of NumPy arrays.
+        fun: (t, y) -> y', (N,), compiled; takes and returns NumPy arrays.
         y0: (N,), the start.
-        unravel: y (N,), or (N, times) as the result has it, -> as that of `FlatODE`, then with a leading axis of times.
+        unravel: y -> the pytrees of `FlatODE.unravel`. y is (N,), or (N, times) as in SciPy's result; the pytrees then
+            have a leading axis of times.
         jac: (t, y) -> the derivative of fun with respect to y, (N, N), compiled.
     """
 
@@ -171,10 +173,10 @@ def scipy_rhs(
     t0: Real = 0.0,
     z0: PyTree = None,
 ) -> ScipyRHS:
-    """The system as SciPy takes it: right-hand side, start and Jacobian, for Radau, BDF and LSODA too.
+    """The right-hand side, start and Jacobian of a system for SciPy's `solve_ivp`, also for Radau, BDF and LSODA.
 
-    Compiled once for each system and structure; new params, and a new start, cost no compilation. A call takes some
-    microseconds, most of them on the way into JAX and out again.
+    Compiled once for each system and structure. New params or a new start cost no compilation. A call takes some
+    microseconds, most of them for calling JAX and converting the result.
 
     Args:
         system, q0, v0, params, t0, z0: as in `simulate`, in double precision.
@@ -185,7 +187,7 @@ def scipy_rhs(
     Raises:
         TypeError, ValueError: an argument of a wrong kind or value; initial values that violate a constraint; single
             precision.
-        NotImplementedError: dry friction.
+        NotImplementedError: dry friction or contact.
 
     >>> import jax.numpy as jnp, hhtjax
     >>> from scipy.integrate import solve_ivp
@@ -210,7 +212,7 @@ def scipy_rhs(
     flat = flat_ode(system, q0, v0, z0)
     packed, unpack = _packed(params)
     functions = [f for f in vars(system).values() if callable(f)]
-    state, programs = [], ()  # of what the functions read
+    state, programs = [], ()  # what the functions read, and the programs compiled for it
 
     def call(which, t, y):
         nonlocal state, programs
@@ -228,18 +230,18 @@ def scipy_rhs(
 def columns(solution: Any) -> dict[str, np.ndarray]:
     """A run as the columns of a table, one row for each saved time: `pandas.DataFrame(columns(solution))`.
 
-    A name is that of the attribute of the `Solution`, then keys of the pytree, then indices of the array: "t", "q[0]",
-    "q.angle", "q.R[0,2]", "acceleration[1]", "multipliers[0]", "contact.normal[0]", "output.pull". What the run does
-    not have has no column.
+    The name of a column is the attribute of the `Solution`, then keys of the pytree, then indices of the array: "t",
+    "q[0]", "q.angle", "q.R[0,2]", "acceleration[1]", "multipliers[0]", "contact.normal[0]", "output.pull". Quantities
+    that the run does not have get no column.
 
     Args:
-        solution: the `Solution` of one run. Of a batch take a member: `jax.tree.map(lambda x: x[i], solution)`.
+        solution: the `Solution` of one run. Select member i of a batch by `jax.tree.map(lambda x: x[i], solution)`.
 
     Returns:
-        Arrays (K + 1,) of NumPy, with their dtype.
+        A dict of NumPy arrays (K + 1,), with the dtype of the run.
 
     Raises:
-        TypeError: what is no `Solution`, or holds tracers.
+        TypeError: `solution` is not a `Solution`, or contains tracers.
         ValueError: a batch of runs.
 
     >>> import jax.numpy as jnp, hhtjax
@@ -253,12 +255,12 @@ def columns(solution: Any) -> dict[str, np.ndarray]:
 
 
 def write_csv(path: str | PathLike, solution: Any) -> None:
-    """A run as a file of comma-separated values: the names of `columns` in the first line, then a line for each time.
+    """Writes a run as comma-separated values: the names of `columns` in the first line, then one line for each time.
 
-    Numbers have the digits that it takes to read the same number back, of float64 up to 17 and of float32 up to 9.
+    Numbers have as many digits as are needed to read the same number back: up to 17 for float64, up to 9 for float32.
 
     Args:
-        path: of the file, which is replaced if it exists.
+        path: path of the file, which is replaced if it exists.
         solution: as in `columns`.
 
     Returns:
@@ -266,7 +268,7 @@ def write_csv(path: str | PathLike, solution: Any) -> None:
 
     Raises:
         TypeError, ValueError: as `columns`.
-        OSError: a file that cannot be written.
+        OSError: the file cannot be written.
 
     >>> import tempfile, jax.numpy as jnp, hhtjax
     >>> from pathlib import Path
@@ -285,7 +287,7 @@ def write_csv(path: str | PathLike, solution: Any) -> None:
 
 
 def _columns(caller: str, solution: Any) -> dict[str, np.ndarray]:
-    """The columns by name, or an error of the caller."""
+    """The columns by name; raises an error that names the caller."""
     fields = getattr(solution, "_fields", ())
     if not {"t", "q", "output"} <= set(fields):
         raise TypeError(f"{caller}: `solution` must be a Solution; received {solution!r}.")
@@ -344,7 +346,8 @@ class _FlatRate(Description):
 
 
 def _packed(params: PyTree):
-    """The params as one vector, if that is what they are, because fewer arguments make a call quicker; the way back."""
+    """The params as one vector if all are float64, because a call with fewer arguments is faster; and the function that
+    restores them."""
     leaves = jax.tree.leaves(params)
     if leaves and all(jnp.result_type(x) == np.float64 for x in leaves):
         vector, unpack = ravel_pytree(jax.tree.map(jnp.asarray, params))
@@ -358,7 +361,8 @@ def _same(x):
 
 @lru_cache(maxsize=64)
 def _compiled(rate, structure, unpack):
-    """Right-hand side and Jacobian as compiled functions of (t, y, packed params). structure: of rate."""
+    """Right-hand side and Jacobian as compiled functions of (t, y, packed params). structure: the pytree structure of
+    rate."""
     rate = jax.tree.unflatten(structure, jax.tree.leaves(rate))  # with what stands for its functions
 
     def program(t, y, packed):
@@ -368,7 +372,7 @@ def _compiled(rate, structure, unpack):
 
 
 def _required(caller: str, package):
-    """A package that not everybody has."""
+    """Imports an optional package; the error says how to install it."""
     try:
         return importlib.import_module(package)
     except ImportError as error:

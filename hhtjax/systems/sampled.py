@@ -14,7 +14,7 @@ from jax import lax
 from hhtjax.checks import require_integer, require_number
 from hhtjax.description import Array, Real, is_array, is_concrete, is_real
 
-SLOP = 8  # roundings that a time may lie before a sample, and still be the sample's
+SLOP = 8  # a time this many roundings before a sample counts as the sample's
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("polynomials", "dt", "t0", "times"), meta_fields=())
@@ -118,18 +118,18 @@ def sampled(values: Real, dt: Real = None, t0: Real = 0.0, order: int = 3, *, ti
         values: (samples,) or (samples, channels...), real; at least order + 1 samples.
         dt: sampling period, positive; t0: time of the first sample.
         times: (samples,), instead of dt and t0: strictly increasing, at any distances. A call then needs a
-            bisection too, some nanoseconds in a compiled run.
+            bisection, too, which takes some nanoseconds in a compiled run.
         order: 0: each value is held until the next, as by a D/A converter; 1: linear; 3: cubic spline, twice
             continuously differentiable ("not-a-knot" ends, as in SciPy's CubicSpline).
 
-    A run treats a held input in params as constant over each step. Steps that end on its jumps keep their order. A
-    jump within a step reduces the order to 1; outside of jit a `JumpWarning` says so. `sweep(..., times=)` ends
-    steps at jumps at any distances, and `adaptive` finds the jumps by itself. At a jump, the saved acceleration is
-    the one before it; `interpolate` also uses it for v after the jump.
+    A run treats a held input (`order=0`) in params as constant over each step. Steps that end on its jumps keep their
+    order. A jump within a step reduces the order to 1; outside of jit a `JumpWarning` says so. `sweep(..., times=)`
+    ends steps at jumps at any distances, and `adaptive` finds the jumps by itself. At a jump, the saved acceleration
+    is the one before it; `interpolate` also uses it for v after the jump.
 
-    Outside the samples the nearest end value is held. Differentiable in values, times and t. A simulation sees an
-    input only through its values at the steps. If the step is shorter than dt, the reconstruction between the
-    samples matters, and the cubic one is far better for smooth signals.
+    Outside the samples the function keeps the nearest end value. Differentiable in values, times and t. A simulation
+    uses the input only at its steps. If the step is shorter than dt, the reconstruction between the samples matters;
+    for smooth signals the cubic one is far better.
 
     Returns:
         A `Sampled`: t -> a number, or (channels...).
@@ -260,7 +260,8 @@ def band_limited(values: Real, dt: Real, *, factor: int = 8, t0: Real = 0.0) -> 
         factor: points per sample. A run with that many steps per sample uses these points exactly.
         t0: time of the first sample.
 
-    Outside the samples the nearest end value is held. Near a jump or a kink, and near the ends, the series rings.
+    Outside the samples the function keeps the nearest end value. Near a jump or a kink, and near the ends, the series
+    oscillates.
 
     Returns:
         A `Sampled`: t -> a number, or (channels...).
@@ -300,7 +301,7 @@ def band_limited_motion(values: Real, dt: Real, cutoff: Real | None) -> tuple[ja
 
     >>> t = 0.01 * jnp.arange(300.0)
     >>> q, v, a = band_limited_motion(jnp.sin(6 * t), 0.01, cutoff=5.0)
-    >>> f"{float(v[100]):.2f} {float(a[100]):.1f}"                                     # 5.76 and 10.06 but for the ends
+    >>> f"{float(v[100]):.2f} {float(a[100]):.1f}"                                     # without the ends 5.76 and 10.06
     '5.75 9.9'
     """
     sampled(values, dt)
@@ -355,7 +356,7 @@ def spline_gain_error(frequency: Real, dt: Real, order: int = 3) -> float:
     References:
         Unser, Aldroubi, Eden, IEEE Trans. Signal Process. 41 (1993): the response of the cardinal spline.
 
-    >>> [f"{spline_gain_error(68.0, 1 / 610.35, order):.1e}" for order in (1, 3)]     # Silverbox at its resonance
+    >>> [f"{spline_gain_error(68.0, 1 / 610.35, order):.1e}" for order in (1, 3)]     # a benchmark at its resonance
     ['4.0e-02', '3.7e-04']
     """
     require_number("spline_gain_error", "dt", dt, lambda x: x > 0, "be positive")

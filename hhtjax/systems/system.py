@@ -41,8 +41,8 @@ class System(Description):
             derivatives, and derivatives of runs its second derivatives. A contact force max(x, 0)**1.5 therefore gives
             NaN: its second derivative is infinite at 0. Write max(x, 1e-12)**1.5 instead.
         constraint: Phi with Phi(q, t) = 0, `constraint(q, t, params)` -> (m,), with independent rows (for dependent
-            rows see `hht`). The equation is then M(q) w = Q + B^T L with B = dPhi/dq and multipliers L. Only steppers
-            of the `hht` family support constraints.
+            rows see `hht`). The equation is then M(q) w = Q + B^T L with B = dPhi/dq and multipliers L. Supported by
+            the `hht` family, `extrapolated` and `conventional_hht`.
         inertia: the product M(q) w without M itself, `inertia(q, w, params)` or `inertia(q, w, t, params)`, a pytree
             structured like v. Use it for chains and trees, whose inverse dynamics take fewer operations than their
             matrix. It replaces the product of `mass` and w in the steps and in their Jacobians. That both agree is not
@@ -66,9 +66,9 @@ class System(Description):
             Both equations are solved together, with one factorisation of their joint matrix, to the order of the
             stepper, however fast z is. (With alpha = 0, or rho_inf = 1, a fast z that starts away from its equilibrium
             oscillates about it without decay, as with the trapezoidal rule. Use a stepper with damping, or start z at
-            its equilibrium.) Supported by the `hht` family, Rosenbrock and Runge-Kutta methods. g must have bounded
-            derivatives, so no relays. The derivative of |z|^nu with respect to nu is not finite at z = 0; write exp(nu
-            log(|z| + 1e-12)) instead.
+            its equilibrium.) Supported by the `hht` family, `extrapolated`, Rosenbrock and Runge-Kutta methods and
+            `taylor`. g must have bounded derivatives, so it cannot describe a relay. The derivative of |z|^nu with
+            respect to nu is not finite at z = 0; write exp(nu log(|z| + 1e-12)) instead.
         friction: F >= 0, the limits of dry friction: `friction(q, v, t, params)`, a pytree structured like v with one
             limit for each coordinate, 0 where there is no friction. With `sliding` it returns (m,), one limit for each
             row of `sliding`. With internal states it takes z after v. With a constraint it takes the multipliers L
@@ -98,9 +98,9 @@ class System(Description):
             `run.contact` holds the contact forces.
 
     q and v are pytrees of the same structure and shapes; n is the number of entries of v. The exception is a rotation:
-    a leaf R (..., 3, 3) of q maps material to spatial components. Its leaf of v is the material angular velocity Om
-    (..., 3), with Rdot = R hat(Om). Its rows of M and Q are moments in material components. Any consistent units work.
-    A System is frozen and hashable; its constant arrays are leaves of a pytree.
+    a leaf R (..., 3, 3) of q maps material to spatial components. The same leaf of v is the material angular velocity
+    Om (..., 3), with Rdot = R hat(Om). Its rows of M and Q are moments in material components. Any consistent units
+    work. A System is frozen and hashable; its constant arrays are leaves of a pytree.
 
     Raises:
         TypeError: a function is not callable (or an array, for `mass`), is not hashable, or takes other arguments;
@@ -297,11 +297,11 @@ class System(Description):
             mass: the mass at the nodes: an array (n,), or a pytree structured like v with a mass for each number, for
                 each node, or one for all; or a function of params that returns one. Or `Elements` with a consistent
                 mass matrix, whose function returns M w of one element, `function(q, w, params)`. Or a list of both.
-            held: nodes whose motion is prescribed, a dict from a node, or a tuple of nodes, to how it is held. True: at
-                its initial position. Booleans structured like a node, as {"r": True} or {"r": [False, True]}: only
-                these components. A function (t, params): the position of the node, structured like its q; velocity and
-                acceleration follow by differentiation; a dict may omit keys. Held components are not unknowns: their
-                rows of `v` contain the prescribed rates.
+            held: nodes whose motion is prescribed: a dict whose keys are nodes, or tuples of nodes. Its values: True
+                fixes the node at its initial position. Booleans structured like a node, as {"r": True} or
+                {"r": [False, True]}, fix only these components. A function (t, params) returns the position of the
+                node, structured like its q (a dict may omit keys); velocity and acceleration follow by differentiation.
+                Prescribed components are not unknowns: their rows of `v` contain the prescribed rates.
             friction, sliding: as for `System`, for the whole system. Steps with dry friction use full matrices, for up
                 to 600 unknowns.
 
@@ -439,7 +439,7 @@ class LagrangianMass:
     """M(q, t) = d2L/dv2, evaluated at v = 0, since it must not depend on v."""
 
     lagrangian: Callable
-    is_lagrangian = True  # knows no rotations
+    is_lagrangian = True  # does not support rotations
 
     def __call__(self, q: Array, t: Real, params: PyTree) -> Array:
         zero, unravel = ravel_pytree(jax.tree.map(jnp.zeros_like, q))

@@ -28,18 +28,18 @@ from hhtjax.description.presentation import is_terminal, overwrite
 # ----------------------------------------------------------------------------
 # Compiled programs that outlive their process: JAX's cache on disk, with a bound on its size.
 
-SETTINGS = {  # of JAX, beside the folder
+SETTINGS = {  # settings of JAX, besides the folder
     "jax_enable_compilation_cache": True,
-    "jax_persistent_cache_min_compile_time_secs": 0.0,  # small programs too: to load one takes a third of compiling it
+    "jax_persistent_cache_min_compile_time_secs": 0.0,  # small programs, too: loading takes a third of compiling
     "jax_persistent_cache_min_entry_size_bytes": -1,
     "jax_compilation_cache_max_size": -1,  # JAX's own bound needs a package that we do not depend on
 }
 WRITTEN = "/jax/compilation_cache/cache_misses"  # the event of JAX before a program is written
-EVERY = 50  # programs that are written, the folder is looked through
+EVERY = 50  # number of written programs after which the size of the folder is checked
 
 
 class _Kept(NamedTuple):
-    """Where programs go to, how many bytes of them, and JAX's settings before."""
+    """Where programs are kept, the limit on their size, and the previous settings of JAX."""
 
     folder: Path
     max_bytes: int
@@ -47,7 +47,7 @@ class _Kept(NamedTuple):
 
 
 _kept: _Kept | None = None
-_written: int | None = None  # programs so far; None until JAX has been asked to tell
+_written: int | None = None  # number of programs written so far; None before the listener is registered
 
 
 def keep_programs(folder: str | os.PathLike[str] | None, max_bytes: int = 1_000_000_000) -> Path | None:
@@ -113,7 +113,7 @@ def keep_programs(folder: str | os.PathLike[str] | None, max_bytes: int = 1_000_
 
 
 def _made(folder) -> Path:
-    """The folder inside for this kind of processor, which exists and can be written to."""
+    """Makes the subfolder for this type of processor, and checks that it can be written to."""
     if not isinstance(folder, (str, os.PathLike)) or isinstance(os.fspath(folder), bytes) or not os.fspath(folder):
         raise TypeError(f"keep_programs: `folder` must be the path of a folder, or None; received {folder!r}.")
     where = Path(folder).expanduser().absolute() / f"programs-{_processor()}"
@@ -130,7 +130,7 @@ def _made(folder) -> Path:
 
 
 def _processor() -> str:
-    """A name of what programs are compiled for: the processor with its sets of instructions."""
+    """A name for the processor and its instruction sets, for which programs are compiled."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
@@ -142,7 +142,7 @@ def _processor() -> str:
 def _set(settings: dict[str, Any]):
     for name, value in settings.items():
         jax.config.update(name, value)
-    compilation_cache.reset_cache()  # the folder that it has opened stays in use otherwise
+    compilation_cache.reset_cache()  # otherwise JAX keeps using the folder that it has opened
 
 
 def _listen():
@@ -163,7 +163,7 @@ def _count(event: str, **_):
 
 
 def _look_through():
-    """Deletes the programs that have not been read for longest, until the rest takes no more than is allowed."""
+    """Deletes the programs that have not been read for the longest time, until the rest is within the limit."""
     if _kept is None:
         return
     found = []
@@ -185,14 +185,14 @@ def _look_through():
 
 
 # ----------------------------------------------------------------------------
-# A line for who waits, where JAX traces or compiles a program of ours for more than two seconds: in a terminal the time
-# so far, else one message of `logging`.
+# A message if JAX traces or compiles a program of this library for more than two seconds: in a terminal a line with the
+# time so far, elsewhere one message by `logging`.
 
 PATIENCE = 2.0  # s
-PERIOD = 0.25  # s between two looks at whether the program is done; a quarter of what the line counts in
-GOODBYE = 1.0  # s that the end of a call waits for the line to be closed
+PERIOD = 0.25  # s between two checks whether the program is done; the line counts in seconds
+GOODBYE = 1.0  # s that the end of a call waits at most for the line to be closed
 COMPILED = "/jax/core/compile/backend_compile_duration"  # the event of JAX after a program was compiled, or loaded
-LOG = logging.getLogger("hhtjax")  # what is not configured writes to stderr
+LOG = logging.getLogger("hhtjax")  # without configuration it writes to stderr
 
 _clocks: dict[int, _Clock] = {}  # by thread
 _hinted: list[bool] = []
@@ -200,15 +200,15 @@ _watching: list[bool] = []
 
 
 class _Clock:
-    """Runs from the first sign of a program that is not compiled yet, in a thread of its own.
+    """Measures the time from the start of tracing until a program is compiled, in a thread of its own.
 
-    Only that thread writes. The one that compiles waits for it no longer than `GOODBYE`, and holds no lock: neither can
+    Only this thread writes. The thread that compiles waits for it at most `GOODBYE` and takes no lock, so neither can
     block the other.
     """
 
     def __init__(self, thread: int):
         self.thread = thread
-        self.frame: FrameType | None = None  # while it is there, the program is not done
+        self.frame: FrameType | None = None  # while it is on the stack of the thread, the program is not compiled
         self.begun = time.monotonic()
         self.is_compiled = self.is_shown = False
         self.over = threading.Event()
@@ -216,7 +216,7 @@ class _Clock:
         self.writer.start()
 
     def run(self):
-        """Until the program is compiled, or given up."""
+        """Runs until the program is compiled, or tracing or compilation has ended with an error."""
         if not self.over.wait(PATIENCE) and self.is_needed():
             self.tell()
         self.frame = None
@@ -229,7 +229,7 @@ class _Clock:
         return waited_for is not None and any(x is waited_for for x in _stack(sys._current_frames().get(self.thread)))
 
     def tell(self):
-        """Two seconds are over."""
+        """Shows the message, after two seconds."""
         if not _is_rewritable():
             LOG.warning(_words())
             while not self.over.wait(PERIOD) and self.is_needed():
@@ -249,11 +249,11 @@ class _Clock:
                 overwrite("", last=False)
 
     def seconds(self) -> float:
-        """So far."""
+        """The time so far."""
         return time.monotonic() - self.begun
 
     def stop(self, is_compiled: bool = False, is_final: bool = False):
-        """The program is done, or given up: what is written from now on begins a line."""
+        """Ends the message: the program is compiled, or has failed. Later output begins on a new line."""
         self.is_compiled = is_compiled
         self.over.set()
         if self.is_shown or is_final:
@@ -261,7 +261,8 @@ class _Clock:
 
 
 def tell_if_long():
-    """From here on, until JAX has compiled a program in this thread, or the call of JAX that leads here has ended."""
+    """Starts the clock of this thread. It stops when JAX has compiled a program in this thread, or when the call of JAX
+    that led here has ended."""
     here = sys._getframe(1)
     thread = threading.get_ident()
     clock = _clocks.get(thread)
@@ -273,7 +274,7 @@ def tell_if_long():
 
 
 def telling_if_long(f: Callable) -> Callable:
-    """The function f, which JAX calls in order to trace it: never for a program that is compiled."""
+    """The function f with a clock around it. JAX calls it only to trace it, not if the program is already compiled."""
 
     @wraps(f)
     def traced(*args: PyTree, **keywords: PyTree) -> PyTree:
@@ -288,27 +289,27 @@ def telling_if_long(f: Callable) -> Callable:
 
 
 def _stack(frame: FrameType | None):
-    """The frame and those that called it."""
+    """Yields the frame and its callers."""
     while frame is not None:
         yield frame
         frame = frame.f_back
 
 
 def _is_rewritable() -> bool:
-    """Whether a line can count up: in a terminal that no other process or thread writes such a line to, and where
-    `logging` is neither configured to take it elsewhere nor to leave it out."""
+    """Whether a line that counts seconds may be used: in a terminal, if no other process or thread writes such a line,
+    and if `logging` is not configured to send the message elsewhere or to suppress it."""
     alone = multiprocessing.parent_process() is None and not any(x.is_shown for x in list(_clocks.values()))
     return alone and is_terminal() and LOG.isEnabledFor(logging.WARNING) and not LOG.hasHandlers()
 
 
 def _words() -> str:
-    """The one message."""
+    """The message for `logging`."""
     words = f"hhtjax: tracing or compiling a program for {PATIENCE:.3g} s by now; only its first call takes so long."
     return words + _hint(" ")
 
 
 def _hint(before: str) -> str:
-    """How to wait less, once in a process, behind what comes before."""
+    """Advice on how to wait less, after the text `before`; only once in a process, otherwise empty."""
     if getattr(jax.config, "jax_compilation_cache_dir") or _hinted:  # noqa: B009
         return ""
     _hinted.append(True)
@@ -316,7 +317,7 @@ def _hint(before: str) -> str:
 
 
 def _stop(is_compiled: bool = False):
-    """The clock of this thread, if there is one."""
+    """Stops the clock of this thread, if there is one."""
     if (clock := _clocks.pop(threading.get_ident(), None)) is not None:
         clock.stop(is_compiled)
 
@@ -327,13 +328,13 @@ def _listener(event: str, duration_secs: float, **_: Any):
 
 
 def _stop_all():
-    """The interpreter ends: no thread may write any more."""
+    """Stops all clocks when the interpreter ends, because no thread may write then."""
     for clock in list(_clocks.values()):
         clock.stop(is_final=True)
 
 
 def _watch():
-    """Once in a process."""
+    """Registers the listeners, once in a process."""
     if not _watching:
         _watching.append(True)
         jax.monitoring.register_event_duration_secs_listener(_listener)
