@@ -1,4 +1,4 @@
-"""Pictures of scenes and mechanisms, moving and still."""
+"""Films and pictures of scenes and mechanisms."""
 
 from __future__ import annotations
 

@@ -254,14 +254,14 @@ def with_unit(name: str, unit: str | None) -> str:
 
 
 # ----------------------------------------------------------------------------
-# What charts take out of a run: entries of its pytrees, by name.
+# The entries of the pytrees of a run, by name.
 
 
 SYMBOLS = {"q": "q", "v": "v", "acceleration": "w", "multipliers": "L", "z": "z"}
 
 
 def require_run(caller: str, solution: Solution):
-    """An error unless it is the solution of one run, with numbers."""
+    """Raises an error unless it is the solution of one run, and outside of jit, vmap and grad."""
     if not isinstance(solution, Solution):
         raise TypeError(f"{caller}: `solution` must be a Solution, as of simulate; received {type(solution).__name__}.")
     require_path(caller, solution)
@@ -286,7 +286,7 @@ def named_entries(tree: PyTree):
 
 
 def chosen_entries(caller: str, solution, quantity, entries):
-    """{name: (leaf name, values)} of one of a solution's quantities, all or those asked for, by entry or leaf."""
+    """{name: (leaf name, values)} of one quantity of a solution: all entries, or those given by entry or leaf."""
     tree = getattr(solution, quantity)
     if tree is None:
         raise ValueError(f"{caller}: the solution has no {quantity}: received a run without.")

@@ -88,9 +88,9 @@ def simulate(
         z0: initial internal states of a `System(..., internal=)`, any pytree of arrays.
         dt: step size, positive. Or (N,), the sizes of N steps, in any order; then leave out `num_steps`. With unequal
             steps the `hht` family keeps order 2 (except for the multipliers of index 3), and a `LinearSystem` is
-            factorised anew in each step. A step more than twice as long as the previous one can make rho_inf near 0
-            unstable. Or `adaptive(rtol, atol)`, which chooses the steps by their errors; derivatives treat these steps
-            as constants.
+            factorised anew in each step. A step more than twice as long as the previous one can make a method with
+            rho_inf near 0 unstable. Or `adaptive(rtol, atol)`, which chooses the steps by their errors; derivatives
+            treat these steps as constants.
         num_steps: number of steps.
         duration: length of the run, instead of num_steps. dt is reduced, if necessary, so that a whole number of steps
             fits; `run.dt` is the size used. The number of steps is then part of the program, so dt and duration cannot
@@ -141,8 +141,8 @@ def simulate(
     instead, so that steps are recomputed only once.
 
     Compiled once for each system, stepper, structure, num_steps and save_every. A new dt, q0 or params costs no
-    compilation unless a type changes: 4 instead of 4.0, np.float64(4.0) instead of 4.0, or an array instead of a number
-    is another program. Functions are compared by identity and by everything they read from outside: globals, closure
+    compilation unless a type changes. 4 instead of 4.0, np.float64(4.0) instead of 4.0, or an array instead of a number
+    needs another program. Functions are compared by identity and by everything they read from outside: globals, closure
     variables, attributes of modules and objects, entries of lists and dicts, and arrays by their bytes. If any of these
     has changed, the program is compiled anew, here as in `fit`. Values passed through params cost no compilation.
     Inside your own `jit` JAX's rule holds: values that a function read during tracing are kept.

@@ -1,4 +1,4 @@
-"""Scenes: systems to start from, one small file each, which return a `Scene`.
+"""Scenes: example systems to start from. Each is a small file with functions that return a `Scene`.
 
 >>> import hhtjax
 >>> scene = hhtjax.scenes.double_pendulum.stiff()
@@ -8,11 +8,12 @@
 >>> run.q.shape
 (1001, 2)
 
-A scene of your own is a file with plain functions, `mass(q, params)` and `force(q, v, t, params)`, and at its end a
-function that returns a `Scene` of them with numbers in SI units, an `InternalScene`, which has a z0 too, or an
-`EventScene`, which has events. With a `drawing`, made of the shapes of `hhtjax.scenes.drawings`, it can be drawn:
-`hhtjax.plot.animation(run, scene)`. The docstring gives the equations and their source; the test compares with
-something that was not computed by this library: a closed form, a table in print, or SciPy.
+To write a scene of your own, make a file with plain functions, `mass(q, params)` and `force(q, v, t, params)`. At its
+end, a function returns a `Scene` of them with numbers in SI units. With internal states it returns an `InternalScene`,
+which also has a z0; with events an `EventScene`. If the scene has a `drawing`, made of the shapes of
+`hhtjax.scenes.drawings`, `hhtjax.plot.animation(run, scene)` makes a film of it. In the docstring give the equations
+and their source. In a test compare with a result that was not computed by this library: a closed form, a published
+table, or SciPy.
 """
 
 from hhtjax.scenes import arm as arm

@@ -3,8 +3,8 @@
 q (N,): joint angles, rad; at q = 0 the frames of all links are parallel to that of the base. The params are those of
 `hhtjax.bodies`: mass, com, inertia, damping, stiffness, springref, ...
 
-Two formulations of one model: `mechanism`, by `hhtjax.bodies`, and `lagrange`, by autodiff of L = T - V in the frames
-of the links.
+There are two formulations of this model: `mechanism` uses `hhtjax.bodies`, and `lagrange` uses automatic
+differentiation of L = T - V in the frames of the links.
 """
 
 from __future__ import annotations
@@ -50,10 +50,12 @@ def mechanism(joints: int = 6) -> Mechanism:
 
 @dataclass(frozen=True)
 class Lagrangian:
-    """L of a chain: over the links, the sum of m u.u/2 + Om.(I Om)/2 + m g.x; u and x of the centre of mass.
+    """L of a chain: the sum of m u.u/2 + Om.(I Om)/2 + m g.x over the links; x and u: position and velocity of the
+    centre of mass.
 
     Attributes:
-        axes: unit vectors of the joints, (N, 3). offsets: joint i seen from joint i - 1, (N, 3), m. As nested tuples.
+        axes: unit vectors of the joints, (N, 3), as nested tuples.
+        offsets: position of joint i in the frame of joint i - 1, (N, 3), m, as nested tuples.
     """
 
     axes: tuple
@@ -78,27 +80,27 @@ class Lagrangian:
 
 
 def joint_torques(q: Array, v: Array, t: Real, params: PyTree) -> Array:
-    """-k (q - rest) - c v. Angles are relative, so the reactions on the links before need no terms."""
+    """-k (q - rest) - c v. Angles are relative, so the reactions on the previous links need no terms."""
     return -params["stiffness"] * (q - params["springref"]) - params["damping"] * v
 
 
 def lagrange(joints: int = 6) -> System:
-    """The arm by its Lagrangian, for the same params."""
+    """The arm as a system made from its Lagrangian, with the same params."""
     axes = tuple(tuple(np.eye(3)["xyz".index(axis)].tolist()) for axis in AXES[:joints])
     return System.from_lagrangian(Lagrangian(axes, OFFSETS[:joints]), joint_torques)
 
 
 def swing(joints: int = 6) -> Scene:
-    """A six-axis arm of 45 kg and 1.2 m, let go from a bent pose; or its first few joints.
+    """A six-axis arm of 45 kg and 1.2 m, let go from a bent pose; or only its first few joints.
 
-    Base yaw, shoulder and elbow pitch on soft springs, wrist roll, wrist pitch and tool roll on stiff ones with strong
-    dampers: time scales from 1 ms to 2 s.
+    Base yaw, shoulder pitch and elbow pitch have soft springs. Wrist roll, wrist pitch and tool roll have stiff springs
+    and strong dampers. The time scales range from 1 ms to 2 s.
 
     Args:
-        joints: how many, 1 to 6.
+        joints: number of joints, 1 to 6.
 
     Raises:
-        TypeError, ValueError: joints is none of these.
+        TypeError, ValueError: joints is not an integer from 1 to 6.
     """
     joints = int(require_number("swing", "joints", joints, lambda n: n in range(1, 7), "be 1, 2, ... 6"))
     arm = mechanism(joints)

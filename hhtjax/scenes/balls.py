@@ -1,9 +1,10 @@
-"""Balls in one dimension: one that bounces on a floor, with and without drag, and two that meet.
+"""Balls in one dimension: one bounces on a floor, with or without drag; two collide.
 
     m w = -m g - c |v| v,   v+ = -e v  at q = floor
 
-Without drag (c = 0), from rest at q = h over the floor, impact k = 1, 2, ... is at t_k = T (1/2 + e + ... + e^(k-1)),
-T = sqrt(8 h/g), and the ball is at rest from T (1/2 + e/(1 - e)) on: infinitely many impacts in a finite time (Zeno).
+Without drag (c = 0), a ball that starts at rest at the height h has its impacts k = 1, 2, ... at the times
+t_k = T (1/2 + e + ... + e^(k-1)) with T = sqrt(8 h/g). It is at rest from the time T (1/2 + e/(1 - e)) on, after
+infinitely many impacts in a finite time.
 """
 
 from __future__ import annotations
@@ -36,18 +37,18 @@ def no_force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
 
 
 def height(q, v, t, params: PyTree):
-    """Over the floor, m."""
+    """The height over the floor, m."""
     return q[0] - params["floor"]
 
 
 def distance(q: Array, v: Array, t: Real, params: PyTree) -> Array:
-    """Between two balls, m."""
+    """The distance between the two balls, m."""
     return q[1] - q[0] - params["diameter"]
 
 
 @drawings.Drawing
 def ball_over_floor(q, t, params: PyTree):
-    """A ball of 5 cm, q over the floor at its lowest point."""
+    """A ball of 5 cm, whose lowest point is at the height q."""
     floor = params["floor"]
     return [
         drawings.wheel((0.0, q[0] + 0.05), 0.05),
@@ -64,7 +65,7 @@ def balls_on_a_line(q, t, params: PyTree):
 
 
 def bouncing(restitution: Real = 0.8, drag: float = 0.1) -> EventScene:
-    """Dropped from 1 m: two impacts in 1.5 s (SI units).
+    """A ball dropped from 1 m, with two impacts in 1.5 s (SI units).
 
     Args:
         restitution: e, in [0, 1]. drag: c, kg/m.
@@ -78,7 +79,7 @@ def bouncing(restitution: Real = 0.8, drag: float = 0.1) -> EventScene:
 
 
 def two(restitution: Real = 1.0) -> EventScene:
-    """One runs into another of the same mass, which is at rest; elastic, they change their velocities (SI units).
+    """A ball runs into another of the same mass, which is at rest. With e = 1 they exchange velocities (SI units).
 
     Args:
         restitution: e, in [0, 1].

@@ -1,4 +1,4 @@
-"""Two masses on a moving belt, each held by a spring, and by one between them: they stick to it and slip.
+"""Two masses on a moving belt, each on a spring, with a third spring between them: they stick to the belt and slip.
 
 s = v - u,    |tau_i| <= F_i (1 + stiction exp(-|s_i|/vs))
 """
@@ -36,7 +36,7 @@ def limit(q, v, t, params: PyTree):
 
 @drawings.Drawing
 def drawing(q, t, params: PyTree):
-    """The blocks on the belt, whose hatches move with it; they are 0.5 m apart where the springs are at rest."""
+    """The blocks on the belt, whose hatches move with it. When the springs are at rest, the blocks are 0.5 m apart."""
     size, wall = 0.2, -0.5
     first, second = q[0], q[1] + 0.5
     low, middle = 0.3 * size, 0.6 * size  # heights of the springs
@@ -53,7 +53,7 @@ def drawing(q, t, params: PyTree):
 
 
 def two_masses() -> Scene:
-    """25 switches in 5 s (SI units)."""
+    """A motion with 25 switches between sticking and slipping in 5 s (SI units)."""
     params = {
         "m": array([1.0, 0.7]), "k": array([30.0, 50.0]), "between": 40.0, "c": 0.05, "u": 0.3,
         "F": array([5.0, 4.0]), "stiction": 0.5, "vs": 0.1,

@@ -1,7 +1,7 @@
 """A chain of rods in space on ball joints, the first at the origin. SI units.
 
-q = {"ball": (N, 3, 3)}, the rotation of each rod as seen from the rod before, from material components; v = {"ball":
-(N, 3)}, material angular velocities relative to the rod before. A tree, in minimal coordinates: no constraints.
+q = {"ball": (N, 3, 3)}: the rotation of each rod relative to the previous rod, from material components. v = {"ball":
+(N, 3)}: material angular velocities relative to the previous rod. These coordinates are minimal: no constraints.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ TILT = np.pi / 3  # from the vertical
 
 
 def mechanism(bodies: int) -> Mechanism:
-    """Rods that hang, each by the upper end of its axis 3 on the lower end of the one before."""
+    """The chain of rods. The upper end of each, on its axis 3, hangs on the lower end of the previous one."""
     across = MASS * (LENGTH**2 / 12 + GYRATION**2 / 2)
     rod = {"mass": MASS, "com": (0, 0, -LENGTH / 2), "inertia": (across, across, MASS * GYRATION**2)}
     first = Body("rod1", "world", Joint("ball"), **rod)
@@ -29,13 +29,13 @@ def mechanism(bodies: int) -> Mechanism:
 
 
 def body_chain(bodies=3, spin=5.0) -> Scene:
-    """Rods of 1 kg and 0.5 m, held out in a line at 60 degrees from the vertical and let go while they spin.
+    """Rods of 1 kg and 0.5 m, which start in a line at 60 degrees from the vertical, and spin about this line.
 
     Args:
-        bodies: N, their number. spin: of each about its own axis, in rad/s.
+        bodies: N, number of rods. spin: angular velocity about the line, in rad/s.
 
     Raises:
-        TypeError, ValueError: bodies is no positive integer, or spin no finite number.
+        TypeError, ValueError: bodies is not a positive integer, or spin is not a finite number.
 
     >>> (mechanism(2).frames(body_chain(bodies=2).q0)["rod2"].x.round(3) + 0.0).tolist()
     [0.433, 0.0, -0.25]
@@ -46,6 +46,6 @@ def body_chain(bodies=3, spin=5.0) -> Scene:
     R = np.tile(np.eye(3), (bodies, 1, 1))
     R[0] = [[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]]
     spins = np.zeros((bodies, 3))
-    spins[0, 2] = spin  # the others turn with it
+    spins[0, 2] = spin  # relative spins: the other rods turn with the first
     start = {"ball": array(R)}, {"ball": array(spins)}
     return Scene(chain.system, chain.params, *start, 2.0, drawings.of_mechanism(chain))

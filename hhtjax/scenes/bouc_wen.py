@@ -1,10 +1,10 @@
-"""Bouc-Wen hysteresis: one degree of freedom whose restoring force z remembers.
+"""Bouc-Wen hysteresis: one degree of freedom with a restoring force z that depends on the past motion.
 
     m w + c v + k q + z = u(t),    zdot = alpha v - beta (gamma |v| |z|^(nu - 1) z + delta v |z|^nu)
 
 The parameters of `benchmark` are those of J.-P. Noel, M. Schoukens, "Hysteretic benchmark with a dynamic nonlinearity",
-Workshop on Nonlinear System Identification Benchmarks, Brussels 2016, with nu = 1. There, beta, gamma and delta enter
-as beta gamma and beta delta only.
+Workshop on Nonlinear System Identification Benchmarks, Brussels 2016, with nu = 1. Only the products beta gamma and
+beta delta enter the equation.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def sampled_mass(q, params: PyTree):
 
 
 def sampled_force(q, v, z, t, params: PyTree):
-    """Q with a measured input: params is a pair (parameters, u), u made by `hhtjax.sampled` or the like."""
+    """Q with a measured input. params is a pair (parameters, u), with u made by `hhtjax.sampled` or similar."""
     params, u = params
     return restoring(q, v, z, params) + u(t)
 
@@ -74,7 +74,7 @@ SAMPLED = System(sampled_mass, sampled_force, internal=sampled_internal)
 
 
 def benchmark() -> InternalScene:
-    """The benchmark's oscillator, driven at 30 Hz below its resonance (SI units)."""
+    """The oscillator of the benchmark, driven at 30 Hz, below its resonance (SI units)."""
     params = {**BENCHMARK, "amplitude": 100.0, "frequency": 2 * jnp.pi * 30.0}
     zero = array([0.0])
     return InternalScene(System(mass, force, internal=internal), params, zero, zero, 0.1, zero, drawing)
@@ -84,8 +84,8 @@ def measured(params: PyTree, u, duration) -> InternalScene:
     """The oscillator at rest, under a given input u.
 
     Args:
-        params: as `BENCHMARK` has them. u: force, N, a function of time that is a pytree, as `hhtjax.sampled` makes.
-        duration: s.
+        params: structured like `BENCHMARK`. u: force, N, a function of time that is a pytree, as from `hhtjax.sampled`.
+        duration: duration of the run, s.
     """
     zero = array([0.0])
     return InternalScene(SAMPLED, (params, u), zero, zero, duration, zero, sampled_drawing)

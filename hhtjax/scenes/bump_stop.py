@@ -1,9 +1,9 @@
-"""A mass that runs into stops with a spring and a damper: a bump stop on one side, backlash between two.
+"""A mass that runs into stops with a spring and a damper: a bump stop on one side, or backlash between two stops.
 
     m w = -k q + A cos(W t) - on K (q - gap) - on C v,    on = 1 beyond the gap, 0 before
 
-The damper makes the force jump at the gap, so `on` is a mode in params, which an event switches: no step crosses the
-jump. A stop holds on to the mass until it is back at the gap, as one whose own mass and preload are left out does.
+The damper makes the force jump at the gap. So `on` is a mode in params that an event switches, and no step crosses the
+jump. The stop has no mass and no preload, and stays attached to the mass until the mass is back at the gap.
 """
 
 from __future__ import annotations
@@ -41,28 +41,28 @@ def with_both(q, v, t, params: PyTree):
 
 
 def before_upper(q, v, t, params: PyTree):
-    """Falls to zero at q = gap, on the way there and on the way back."""
+    """A guard that falls to zero at q = gap, on the way there and on the way back."""
     return (params["gap"] - q[0]) * (1 - 2 * params["upper"])
 
 
 def before_lower(q, v, t, params: PyTree):
-    """The same at q = -gap."""
+    """As `before_upper`, at q = -gap."""
     return (params["gap"] + q[0]) * (1 - 2 * params["lower"])
 
 
 def turn_upper(params: PyTree):
-    """The upper stop on or off."""
+    """Switches the upper stop on or off."""
     return params | {"upper": 1 - params["upper"]}
 
 
 def turn_lower(params: PyTree):
-    """The lower one."""
+    """Switches the lower stop on or off."""
     return params | {"lower": 1 - params["lower"]}
 
 
 @drawings.Drawing
 def drawing_with_upper(q, t, params: PyTree):
-    """The mass on its spring, and the stop, whose plate it takes along."""
+    """The mass on its spring, and the stop, whose plate moves with the mass during contact."""
     half, end = 0.1, params["gap"] + 0.5
     plate = max(q[0], params["gap"]) + half
     stop = drawings.spring((plate, half), (end, half), half), drawings.bar((plate, 0.04), (plate, 0.16))
@@ -85,13 +85,13 @@ UPPER, LOWER = Event(before_upper, switch=turn_upper), Event(before_lower, switc
 
 
 def bump_stop() -> EventScene:
-    """Three strokes into a stop 0.3 m away, from 3 m/s, without a drive (SI units)."""
+    """A mass that starts at 3 m/s and runs three times into a stop 0.3 m away, without a drive (SI units)."""
     params = {"m": 1.0, "k": 20.0, "A": 0.0, "W": 0.0, "K": 400.0, "C": 5.0, "gap": 0.3, "upper": 0.0}
     return EventScene(System(mass, with_upper), params, array([0.0]), array([3.0]), 3.0, (UPPER,), drawing_with_upper)
 
 
 def backlash() -> EventScene:
-    """A mass driven to and fro between two flanks 10 mm apart: 11 crossings of their surfaces (SI units)."""
+    """A mass driven to and fro between two stops 10 mm apart. It crosses their surfaces 11 times (SI units)."""
     params = {
         "m": 1.0, "k": 0.0, "A": 20.0, "W": 20.0, "K": 1e4, "C": 20.0, "gap": 0.005, "upper": 0.0, "lower": 0.0,
     }  # fmt: skip

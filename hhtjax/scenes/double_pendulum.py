@@ -65,13 +65,13 @@ def drawing(q, t, params: PyTree):
     return [drawings.bar(np.zeros(2), links[0], links[0] + links[1])]
 
 
-@cache  # equal functions for equal systems
+@cache  # the same system at each call, so that it is compiled once
 def _using(trigonometry, function: Callable):
     return function if trigonometry is jnp else partial(function, trigonometry=trigonometry)
 
 
 def free(trigonometry=jnp) -> Scene:
-    """No springs, no dampers: chaotic, conservative.
+    """No springs and no dampers: a chaotic motion that conserves energy.
 
     Args:
         trigonometry: the module whose sin and cos it uses, such as `hhtjax.trigonometry`.
@@ -82,10 +82,10 @@ def free(trigonometry=jnp) -> Scene:
 
 
 def stiff(as_printed: bool = False, trigonometry=jnp) -> Scene:
-    """Stiff joints, the second one damped by 10000 N m s/rad.
+    """Stiff joints. The second one has a damper of 10000 N m s/rad.
 
     Args:
-        as_printed: True for the torques as the paper prints them.
+        as_printed: True: the joint torques as the paper prints them, see `force_as_printed`.
         trigonometry: the module whose sin and cos it uses, such as `hhtjax.trigonometry`.
     """
     params = {"m": (10.0, 1.0), "l": (1.0, 1.5), "k": (400.0, 300.0), "c": (15.0, 10000.0), "g": GRAVITY}
@@ -95,12 +95,12 @@ def stiff(as_printed: bool = False, trigonometry=jnp) -> Scene:
 
 
 def left_of_stop(q, v, t, params: PyTree):
-    """The angle of joint 2 that is left before its stop, rad."""
+    """The remaining angle of joint 2 before its stop, rad."""
     return params["stop"] - (q[1] - q[0])
 
 
 def stopped(restitution: Real = 0.7) -> EventScene:
-    """Free, with a stop at the angle of joint 2, as an elbow has: the links meet it three times.
+    """As `free`, with a stop at joint 2 like that of an elbow. The links hit it three times.
 
     Args:
         restitution: e of the stop, in [0, 1].

@@ -1,7 +1,7 @@
-"""Shapes to draw scenes with: `Scene.drawing` returns a list of them, and `hhtjax.plot.animation` draws them.
+"""Shapes for drawings of scenes: `Scene.drawing` returns a list of them, and `hhtjax.plot.animation` draws them.
 
-A shape is a polyline and the kind of part that it stands for. Springs and blocks are symbols, in metres like
-the rest: only what the coordinates say is to scale.
+A shape is a polyline with the kind of part that it represents. Its points are in metres. Springs and blocks are
+symbols: only their positions are to scale, not their sizes.
 
 >>> import numpy as np
 >>> from hhtjax.scenes import drawings
@@ -20,7 +20,7 @@ import numpy as np
 
 from hhtjax.description import Array, PyTree, Real
 
-Points = Any  # what NumPy makes an array of
+Points = Any  # anything that NumPy converts to an array
 
 
 class Shape(NamedTuple):
@@ -28,7 +28,7 @@ class Shape(NamedTuple):
 
     Attributes:
         points: (k, 2) or (k, 3), m.
-        kind: "bar", with a joint at each point; "body", "spring", "ground", "arrow" or "aim", which is dashed.
+        kind: "bar", with a joint at each point; "body", "spring", "ground", "arrow", or "aim", a dashed line.
     """
 
     points: np.ndarray
@@ -38,10 +38,10 @@ class Shape(NamedTuple):
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Drawing:
-    """A function drawing(q, t, params) that gives shapes, as part of a scene that may go into `jax.jit`; a decorator.
+    """A decorator for a function drawing(q, t, params) that returns shapes. Its scene can then be passed to `jax.jit`.
 
     Attributes:
-        shapes: the function; q and params of NumPy arrays, t in s.
+        shapes: the function; q and params contain NumPy arrays, t is in s.
     """
 
     shapes: Callable[[PyTree, Real, PyTree], list[Shape]]
@@ -64,7 +64,7 @@ def block(centre: Points, width: Real, height: Real, angle: Real = 0.0) -> Shape
 
 
 def wheel(centre: Points, radius: Real, along: Points = (1, 0), up: Points = (0, 1), corners: int = 24) -> Shape:
-    """A circle with one spoke, which lies along `along`; in the plane, or in space in the plane of two unit vectors."""
+    """A circle with one spoke in the direction `along`; in space it lies in the plane of two unit vectors."""
     centre, along, up = (np.asarray(x, float) for x in (centre, along, up))
     angle = np.linspace(0, 2 * np.pi, corners + 1)[:, None]
     rim = centre + radius * (np.cos(angle) * along + np.sin(angle) * up)
@@ -72,7 +72,7 @@ def wheel(centre: Points, radius: Real, along: Points = (1, 0), up: Points = (0,
 
 
 def spring(first: Points, second: Points, width: Real, coils: int = 5) -> Shape:
-    """A zigzag between two points, as wide as said; in space it zigzags in a vertical plane."""
+    """A zigzag of the given width between two points; in space it turns in the plane of x and z."""
     first, second = np.asarray(first, float), np.asarray(second, float)
     way = second - first
     share = np.array([0, 1, *np.linspace(1.25, coils + 0.75, 2 * coils), coils + 1, coils + 2]) / (coils + 2)
@@ -81,9 +81,9 @@ def spring(first: Points, second: Points, width: Real, coils: int = 5) -> Shape:
 
 
 def ground(first: Points, second: Points, depth: Real, hatches: int = 8, shift: Real = 0.5) -> Shape:
-    """A hatched line in the plane, solid on the right of the way from the first point to the second.
+    """A hatched line in the plane. The hatches are on the right as seen from the first point to the second.
 
-    shift: of the hatches along it, in parts of their distance.
+    shift: shift of the hatches along the line, as a fraction of their distance.
     """
     first, second = np.asarray(first, float), np.asarray(second, float)
     way = second - first
@@ -96,7 +96,7 @@ def ground(first: Points, second: Points, depth: Real, hatches: int = 8, shift: 
 
 
 def arrow(start: Points, way: Points, size: Real) -> Shape:
-    """From a point along a vector, with a head; size: the length of the longest arrow of its kind, m."""
+    """An arrow from a point along a vector; size: the length of the longest arrow of its kind, m."""
     start, way = np.asarray(start, float), np.asarray(way, float)
     end, length = start + way, np.linalg.norm(way)
     head = 0.25 * min(length, size) * (way / length if length > 0 else way)
@@ -105,7 +105,7 @@ def arrow(start: Points, way: Points, size: Real) -> Shape:
 
 
 def aim(*points: Points) -> Shape:
-    """A dashed line, where something ought to be."""
+    """A dashed line, for a desired position."""
     return Shape(np.stack([np.asarray(x, float) for x in points]), "aim")
 
 
@@ -115,9 +115,9 @@ def on_a_spring(
     """A block whose middle is at x = place, on a level floor, and a spring to a wall on its left.
 
     Args:
-        place: m, 0 where the spring is at rest.
-        size: of the block, m; the spring is three times as long.
-        force: of a drive, as a part of its amplitude, for an arrow; None without.
+        place: position of the block, m; 0 where the spring is at rest.
+        size: size of the block, m; the spring is three times as long.
+        force: force of a drive, as a fraction of its amplitude, drawn as an arrow; None: no arrow.
         sprung: whether there is a spring. floor: whether there is a floor.
     """
     half, wall = size / 2, -3.5 * size
@@ -130,7 +130,7 @@ def on_a_spring(
 
 
 def wall_at(x: Real, size: Real, side: int) -> Shape:
-    """A wall that stands at x, 1.5 times as high as `size`; side: -1 where it is on the left of what moves, 1 right."""
+    """A wall at x, of the height 1.5 `size`; side: -1 if it is on the left of the moving part, 1 on the right."""
     low, high = (x, 0.0), (x, 1.5 * size)
     return ground(low, high, 0.2 * size, 4) if side > 0 else ground(high, low, 0.2 * size, 4)
 
@@ -141,6 +141,6 @@ def of_mechanism(mechanism: Any) -> Drawing:
 
 
 def _across(way: Array) -> np.ndarray:
-    """The unit vector at a right angle to a vector: on its left; in space in the vertical plane of x, or across it."""
+    """A unit vector normal to `way`: on its left; in space in the plane of x and z."""
     across = np.array([-way[1], way[0]] if len(way) == 2 else [-way[2], 0.0, way[0]])
     return across / max(np.linalg.norm(across), 1e-300)

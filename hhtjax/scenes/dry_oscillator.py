@@ -1,8 +1,9 @@
-"""A mass on a spring and a dry surface: free, and driven by a sine, with stiction.
+"""A mass on a spring that slides on a dry surface: free, or driven by a sine, with stiction.
 
     m w = -k q - c v + A sin(W t) - tau,    |tau| <= F (1 + stiction exp(-|v|/vs))
 
-Free, without damping and stiction, its motion is half cosines about F/k and -F/k in turn, until the spring is too weak.
+The free motion without damping and stiction consists of half cosines, in turn about F/k and -F/k. It ends when the
+spring is too weak to move the mass.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def limit(q: Array, v: Array, t: Real, params: PyTree):
 
 @drawings.Drawing
 def drawing(q, t, params: PyTree):
-    """The mass on its spring and the surface; an arrow for the force, where there is one."""
+    """The mass on its spring and the surface; an arrow for the force, if there is one."""
     force = np.sin(params["W"] * t) if params["A"] else None
     return drawings.on_a_spring(q[0], size=0.3, force=force)
 
@@ -42,16 +43,16 @@ SYSTEM = System(mass, force, friction=limit)
 
 
 def free() -> Scene:
-    """Five reversals, then it sticks (SI units)."""
+    """A free motion: the mass reverses five times, then it sticks (SI units)."""
     params = {"m": 1.0, "k": 100.0, "c": 0.0, "A": 0.0, "W": 0.0, "F": 4.0, "stiction": 0.0, "vs": 0.05}
     return Scene(SYSTEM, params, array([0.5]), array([0.0]), 2.2, drawing)
 
 
 def driven(stiction: float = 0.3) -> Scene:
-    """Stick and slip: 20 switches (SI units).
+    """A driven motion with 20 switches between sticking and slipping (SI units).
 
     Args:
-        stiction: how much larger the limit is at rest than in fast sliding, over that; with 0 it is Coulomb's.
+        stiction: relative increase of the limit from fast sliding to rest; 0: Coulomb's law.
 
     Returns:
         A `Scene`.

@@ -27,7 +27,7 @@ def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
 
 
 def sampled_force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
-    """Q with a measured input: params is a pair (parameters, u), u made by `hhtjax.sampled`."""
+    """Q with a measured input. params is a pair (parameters, u), with u made by `hhtjax.sampled`."""
     params, u = params
     return restoring(q, v, params) + u(t) + params["offset"]
 
@@ -39,7 +39,7 @@ def sampled_mass(q: Array, params: PyTree) -> Array:
 
 @drawings.Drawing
 def drawing(q, t, params: PyTree):
-    """The mass on its spring; an arrow for the force, where there is one."""
+    """The mass on its spring; an arrow for the force, if there is one."""
     force = np.cos(params["frequency"] * t) if params["amplitude"] else None
     return drawings.on_a_spring(q[0], size=0.6, force=force)
 
@@ -57,7 +57,7 @@ def driven() -> Scene:
 
 
 def hardening_spring() -> Scene:
-    """A stiff hardening spring let go, 100 q + 10^4 q^3: where the predictor form fails first."""
+    """A mass released on a stiff hardening spring, 100 q + 10^4 q^3. Here `linearize="predictor"` fails first."""
     params = {"m": 1.0, "c": 0.0, "k": 100.0, "k2": 0.0, "k3": 1e4, "amplitude": 0.0, "frequency": 0.0}
     return Scene(System(mass, force), params, array([1.0]), array([0.0]), 2.0, drawing)
 
@@ -66,10 +66,10 @@ def measured(params: PyTree, u, q0: PyTree, v0: PyTree, duration) -> Scene:
     """An oscillator under a sampled input.
 
     Args:
-        params: of `driven`, with offset in the place of amplitude and frequency.
+        params: those of `driven`, with offset instead of amplitude and frequency.
         u: the input, made by `hhtjax.sampled`.
-        q0, v0: numbers.
-        duration: s.
+        q0, v0: initial position and velocity, numbers.
+        duration: duration of the run, s.
     """
     start = jnp.reshape(q0, (1,)), jnp.reshape(v0, (1,))
     return Scene(System(sampled_mass, sampled_force), (params, u), *start, duration, sampled_drawing)

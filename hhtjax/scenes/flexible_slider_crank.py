@@ -1,15 +1,17 @@
 """Simeon's flexible slider-crank: a crank that turns at a given speed, an elastic rod, and a slider. SI units.
 
-q = (phi1, phi2, x, w1, w2, u1, u2): the angles of crank and rod from the x axis in rad, the slider's position on it
-and the elastic displacement of the rod in m, in the frame through both its ends. At s = 0 ... 1 times its length l2 it
-is w1 sin(pi s) + w2 sin(2 pi s) across the rod, and along it the quadratic with u1 in the middle, u2 at the slider.
+q = (phi1, phi2, x, w1, w2, u1, u2): phi1 and phi2 are the angles of crank and rod from the x axis, in rad. x is the
+position of the slider on this axis, in m. The others are elastic displacements of the rod, in m, in the frame through
+both its ends. At the distance s l2 from the crank, s = 0 ... 1, the displacement across the rod is
+w1 sin(pi s) + w2 sin(2 pi s). The displacement along the rod is a quadratic in s: 0 at the crank, u1 in the middle and
+u2 at the slider.
 
 m (2,): masses of rod and slider. J (2,): moments of inertia of the crank about its pivot, and of the rod about its end.
-EA, EI: stiffness of the rod; D (4, 4): its damping; stiffening: the factor of the energy EA/2 l2 int u' w'^2 ds, with
-which a pull stiffens the rod.
+EA, EI: stiffnesses of the rod; D (4, 4): its damping. stiffening: the factor of the energy EA/2 l2 int u' w'^2 ds, by
+which tension stiffens the rod.
 
-The numbers, the rounding of pi included, are those of the test set. So is the mass that moves along the rod: it is 15
-times that of the shape functions, in all terms of u^2.
+The numbers are those of the test set, including its rounding of pi. In all terms of u^2 the test set has 15 times the
+mass that follows from the shape functions; this scene has it, too.
 
 References:
     Simeon (1996), Modelling a flexible slider crank mechanism by a mixed system of DAEs and PDEs, Mathematical
@@ -35,7 +37,8 @@ BENDING, STRETCHING, COUPLING = [PI**4 / 2, PI**4 * 8], [[16 / 3, -8 / 3], [-8 /
 
 
 def integrals(dtype: Any):
-    """Over s, of the shape functions of w and of u: alone, times s, times each other; and of w's times u's."""
+    """Integrals over s of the shape functions of w and of u: alone, times s, and times each other; and of the products
+    of those of w and u."""
     alone = [2 / PI, 0.0], [2 / 3, 1 / 6]
     times_s = [1 / PI, -1 / (2 * PI)], [1 / 3, 1 / 6]
     twice = [[0.5, 0.0], [0.0, 0.5]], [[8.0, 1.0], [1.0, 2.0]]
@@ -58,7 +61,7 @@ def mass(q: Array, params: PyTree) -> Array:
 
 
 def elastic_force(w: Array, u: Array, params: PyTree):
-    """On w and on u: minus the slopes of the energy of the rod."""
+    """Elastic forces on w and on u: minus the derivatives of the energy of the rod."""
     EA, EI, l2 = params["EA"], params["EI"], params["l"][1]
     pull = params["stiffening"] * EA / 2 * (PI / l2) ** 2
     mixed, product = COUPLING * (4 * u[0] - 2 * u[1]), w[0] * w[1]
@@ -117,14 +120,14 @@ def drawing(q, t, params: PyTree):
 
 
 def flexible_slider_crank(stiffening: bool = False, damping: bool = False) -> Scene:
-    """From the stretched position the crank turns at 150 rad/s, by 15 rad; the rod hardly vibrates at first.
+    """The crank turns by 15 rad at 150 rad/s, from the stretched position. The rod hardly vibrates at first.
 
-    The published end is that without stiffening and damping. Undamped, the rod bends at 1.3e3 and 5.1e3 rad/s and
-    vibrates lengthwise at 6.6e3 and 2.3e4 rad/s: the published end takes steps that resolve all of these. The start is
-    the published one, but for the slider's place, which is rounded to 1e-10 m there.
+    The published end values are those without stiffening and damping. The undamped rod bends at 1.3e3 and 5.1e3 rad/s
+    and vibrates lengthwise at 6.6e3 and 2.3e4 rad/s. To reproduce the published values, steps must resolve all of
+    these. The start is the published one, except for the slider's position, which is rounded to 1e-10 m there.
 
     Args:
-        stiffening: whether a pull stiffens the rod.
+        stiffening: whether tension stiffens the rod.
         damping: whether the rod's vibrations are damped, by half a per cent.
 
     >>> from hhtjax.scenes.flexible_slider_crank import flexible_slider_crank

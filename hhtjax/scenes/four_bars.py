@@ -4,8 +4,8 @@ N + 1 cranks stand on pivots A_i = (i l, 0), i = 0 ... N, and N couplers join th
 slender and uniform, of the length l (m) and the mass m (kg); gravity g (m/s^2) acts along -y.
 
 q (N + 1, 2): the points B_i, in m. Phi (2 N + 1,): (length^2 - l^2)/2 of the cranks, then of the couplers. When the
-cranks lie along the x axis, so do the couplers, and the rank of B = dPhi/dq falls from 2 N + 1 to N + 1: the
-multipliers are not unique there, and the loops could fold. Twice per turn the benchmark passes through such a position.
+cranks lie along the x axis, so do the couplers. The rank of B = dPhi/dq then falls from 2 N + 1 to N + 1: the
+multipliers are not unique, and the loops could fold. The benchmark passes through such a position twice per turn.
 
 While no loop folds, all cranks are at one angle a from the x axis, and
 
@@ -31,7 +31,7 @@ GRAVITY = 9.81
 
 
 def couplers(q: Array) -> Array:
-    """(N + 1, N + 1): 1 where a coupler joins B_i and B_j."""
+    """A matrix (N + 1, N + 1) with 1 where a coupler joins B_i and B_j."""
     upper = jnp.eye(len(q), k=1, dtype=q.dtype)
     return upper + upper.T
 
@@ -71,13 +71,13 @@ def drawing(q, t, params: PyTree):
 
 
 def four_bars(loops: int = 2) -> Scene:
-    """N = loops squares of 1 m bars of 1 kg, whose upper row starts at 1 m/s.
+    """A row of N squares of 1 m bars of 1 kg, whose upper bars start at 1 m/s.
 
     Args:
-        loops: N, their number.
+        loops: N, number of squares.
 
     Raises:
-        ValueError: loops is no positive integer.
+        ValueError: loops is not a positive integer.
 
     >>> four_bars(loops=2).q0.tolist()
     [[0.0, 1.0], [1.0, 1.0], [2.0, 1.0]]

@@ -25,12 +25,12 @@ def mass(q, params: PyTree):
 
 
 def force(q, v, t, params: PyTree):
-    """Q before the stop."""
+    """Q, without the stop."""
     return params["A"] * jnp.cos(params["W"] * t) - params["k"] * q - params["c"] * v
 
 
 def room(q, v, t, params: PyTree):
-    """How far the stop is, m."""
+    """The distance to the stop, m."""
     return params["wall"] - q[0]
 
 
@@ -43,7 +43,7 @@ def drawing(q, t, params: PyTree):
 
 
 def driven(restitution: Real = 0.8) -> EventScene:
-    """Stop at the middle of the oscillation, driven at 2.6 times the frequency without it (SI units).
+    """The stop is at the rest position. The drive has 2.6 times the natural frequency without stop (SI units).
 
     Args:
         restitution: e, in [0, 1].

@@ -1,4 +1,4 @@
-"""LuGre friction: a mass that a spring drags over a surface, whose bristles bend by z before they slip.
+"""LuGre friction: a spring drags a mass over a surface, whose bristles bend by z before they slip.
 
     F = sigma0 z + sigma1 zdot + sigma2 v,    zdot = v - sigma0 |v| z/s(v),    s(v) = Fc + (Fs - Fc) exp(-(v/vs)^2)
 
@@ -21,7 +21,7 @@ def mass(q, params: PyTree):
 
 
 def internal(q, v, z, t, params: PyTree):
-    """zdot."""
+    """zdot, the rate of the bristles."""
     steady = params["coulomb"] + (params["static"] - params["coulomb"]) * jnp.exp(-((v / params["stribeck"]) ** 2))
     return v - params["sigma0"] * jnp.abs(v) * z / steady
 
@@ -34,7 +34,7 @@ def force(q, v, z, t, params: PyTree):
 
 @drawings.Drawing
 def drawing(q, t, params: PyTree):
-    """The mass on the surface, and the spring, whose far end moves; it is drawn 0.5 m long where it is at rest."""
+    """The mass on the surface, and the spring, whose far end moves. A spring at rest is drawn 0.5 m long."""
     half = 0.1
     end = params["speed"] * t + half + 0.5
     return [
@@ -46,7 +46,7 @@ def drawing(q, t, params: PyTree):
 
 
 def stick_slip() -> InternalScene:
-    """The experiment of the source, Sec. III-C: 1 kg dragged at 0.1 m/s sticks and slips (SI units)."""
+    """The experiment of the paper, Sec. III-C: a mass of 1 kg dragged at 0.1 m/s sticks and slips (SI units)."""
     params = {
         "m": 1.0, "k": 2.0, "speed": 0.1, "sigma0": 1e5, "sigma1": 1e5**0.5, "sigma2": 0.4,
         "coulomb": 1.0, "static": 1.5, "stribeck": 1e-3,

@@ -1,4 +1,4 @@
-"""A mass on a spring with Maxwell branches, spring and damper in series, of time constants far apart."""
+"""A mass on a spring and Maxwell branches, each a spring and a damper in series, with very different time constants."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def internal(q, v, z, t, params: PyTree):
 
 @drawings.Drawing
 def drawing(q, t, params: PyTree):
-    """The mass on the mount, a spring beside rubber, which stands for the branches; an arrow for the force."""
+    """The mass on its mount, drawn as a spring and a piece of rubber for the branches; an arrow for the force."""
     size, wall = 0.02, -0.07
     low, high = 0.25 * size, 0.7 * size
     face = q[0] - size / 2
@@ -43,7 +43,7 @@ def drawing(q, t, params: PyTree):
 
 
 def vibration() -> InternalScene:
-    """A rubber mount, driven near its resonance; the branches relax in 1 s, 30 ms and 0.1 ms (SI units)."""
+    """A rubber mount driven near its resonance, with time constants of 1 s, 30 ms and 0.1 ms (SI units)."""
     params = {
         "m": 2.0, "k": 800.0, "amplitude": 5.0, "frequency": 22.0,
         "stiffness": array([100.0, 200.0, 1e4]), "tau": array([1.0, 3e-2, 1e-4]),

@@ -1,4 +1,4 @@
-"""A joint on a geared motor, under a PI controller with velocity feedback: its current and the integral are states."""
+"""A joint on a geared motor under a PI controller with velocity feedback; internal states: current and integral."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def force(q: Array, v: Array, z: dict, t: Real, params: PyTree) -> Array:
 
 
 def internal(q: Array, v: Array, z: dict, t: Real, params: PyTree):
-    """L di/dt = U - R i - (back EMF), and the rate of the integral: the error of the angle."""
+    """The rate of the current from L di/dt = U - R i - (back EMF), and that of the integral, the error of the angle."""
     error = params["amplitude"] * jnp.sin(params["frequency"] * t) - q
     voltage = params["kp"] * error + params["ki"] * z["integral"] - params["kd"] * v
     back_emf = params["gear"] * params["torque_constant"] * v
@@ -35,7 +35,7 @@ def internal(q: Array, v: Array, z: dict, t: Real, params: PyTree):
 
 @drawings.Drawing
 def drawing(q, t, params: PyTree):
-    """The link of 0.5 m, the motor it sits on, and the angle that it is to have, dashed."""
+    """The link of 0.5 m, its motor, and the desired angle as a dashed line."""
 
     def end(angle):
         return 0.5 * np.array([np.sin(angle), -np.cos(angle)])
@@ -50,7 +50,7 @@ def drawing(q, t, params: PyTree):
 
 
 def tracking() -> InternalScene:
-    """A link of 1 kg and 0.5 m follows a sine; the current, L/R = 1 ms, is far faster than the motion (SI units)."""
+    """A link of 1 kg and 0.5 m follows a sine. The current is far faster than the motion: L/R = 1 ms (SI units)."""
     params = {
         "link_inertia": 1.0 * 0.5**2 / 3, "rotor_inertia": 2e-5, "gear": 50.0, "friction": 0.05,
         "weight": 1.0 * GRAVITY * 0.25, "torque_constant": 0.05, "resistance": 1.0, "inductance": 1e-3,

@@ -1,7 +1,7 @@
-"""One simple pendulum in three formulations: a rod as a constraint, a stiff spring in its place, and one angle.
+"""A simple pendulum in three formulations: the rod as a constraint, a stiff spring instead of the rod, and one angle.
 
 A point mass m (kg) at the distance l (m) from the origin, under gravity g (m/s^2) along -y. It starts at its lowest
-point with a horizontal velocity, by default as in Cardona, Geradin (1989), Sec. 4.1, as far as their figure is legible.
+point with a horizontal velocity. The default is that of Cardona, Geradin (1989), Sec. 4.1, read from their figure.
 
     cartesian   q = (x, y)    m w = m g + B^T L,  Phi = (x^2 + y^2 - l^2)/2 = 0; the tension of the rod is -l L
     elastic     q = (x, y)    m w = m g - k (r - l) (x, y)/r,  r = sqrt(x^2 + y^2)
@@ -57,7 +57,7 @@ def moment_of_weight(q, v, t, params: PyTree):
 
 @drawings.Drawing
 def drawing_cartesian(q, t, params: PyTree):
-    """The rod; the wall, where there is one."""
+    """The rod; the wall, if there is one."""
     shapes = [drawings.bar(np.zeros(2), q)]
     if "wall" in params:
         x, length = params["wall"], params["l"]
@@ -81,10 +81,10 @@ def cartesian(speed: float = 2.505, length: float = 0.5) -> Scene:
     """The rod as a constraint.
 
     Args:
-        speed: at the lowest point, in m/s. length: of the rod, in m.
+        speed: speed at the lowest point, in m/s. length: length of the rod, in m.
 
     Raises:
-        TypeError, ValueError: speed is no finite number, length no positive one.
+        TypeError, ValueError: speed is not a finite number, or length is not a positive one.
     """
     params = _params("cartesian", speed, length)
     start = array([0.0, -length]), array([speed, 0.0])
@@ -92,17 +92,17 @@ def cartesian(speed: float = 2.505, length: float = 0.5) -> Scene:
 
 
 def elastic(k: float = 1e6, speed: float = 2.505, length: float = 0.5) -> Scene:
-    """A spring of stiffness k (N/m) instead of the rod, whose motion it tends to as 1/k.
+    """A spring of stiffness k (N/m) instead of the rod. The difference from the motion with the rod falls as 1/k.
 
-    It starts stretched by as much as carries the weight and turns the mass, k (r - l) = m (g + speed^2/r), so the
-    spring hardly vibrates. The frequency of such a vibration is sqrt(k/m).
+    The spring starts stretched so that it carries the weight and turns the mass, k (r - l) = m (g + speed^2/r). So it
+    hardly vibrates. The frequency of such a vibration is sqrt(k/m).
 
     Args:
         k: stiffness, N/m.
         speed, length: as in `cartesian`.
 
     Raises:
-        TypeError, ValueError: as `cartesian`, and where k is no positive number.
+        TypeError, ValueError: as `cartesian`, or k is not a positive number.
     """
     params = _params("elastic", speed, length)
     params["k"] = require_number("elastic", "k", k, lambda x: 0 < x < np.inf, "be positive and finite")
@@ -127,18 +127,18 @@ def minimal(speed: float = 2.505, length: float = 0.5) -> Scene:
 
 
 def room_before_wall(q, v, t, params: PyTree):
-    """How far the mass is from the wall, m."""
+    """The distance of the mass from the wall, m."""
     return params["wall"] - q[0]
 
 
 def walled(wall: float = 0.3, restitution: Real = 0.7) -> EventScene:
-    """`cartesian` with a vertical wall on its way: the impulse keeps the length of the rod.
+    """`cartesian` with a vertical wall in its way. The impulse of the impact obeys the constraint of the rod.
 
     Args:
-        wall: where, in m; less than the length of the rod, 0.5 m. restitution: e, in [0, 1].
+        wall: x of the wall, in m; less than the length of the rod, 0.5 m. restitution: e, in [0, 1].
 
     Raises:
-        TypeError, ValueError: a wall that the mass does not reach.
+        TypeError, ValueError: the mass does not reach the wall.
     """
     scene = cartesian()
     length = scene.params["l"]

@@ -15,7 +15,7 @@ from hhtjax.systems.system import LinearSystem, System
 
 
 class _Drawn(tuple):
-    """A named tuple that knows how it is drawn. The drawing is no entry: not unpacked, and no leaf of a pytree."""
+    """A named tuple with a drawing. The drawing is not an entry: it is not unpacked, and not a leaf of the pytree."""
 
     drawing: Drawing | None = None
 
@@ -26,7 +26,7 @@ class _Drawn(tuple):
         return scene
 
     def _replace(self, /, **changes: Any) -> Self:
-        """The scene with other entries."""
+        """The scene with some entries replaced."""
         return self._with(self.drawing, super()._replace(**changes))  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -58,7 +58,7 @@ class _InternalScene(NamedTuple):
 
 @shown
 class Scene(_Drawn, _Scene):
-    """A system, and what a run needs besides a stepper and a step size: `system, params, q0, v0, duration = scene`.
+    """A system with all data of a run except stepper and step size: `system, params, q0, v0, duration = scene`.
 
     Attributes:
         system, params: the system and its parameters.
@@ -73,7 +73,7 @@ class Scene(_Drawn, _Scene):
 
 @shown
 class EventScene(_Drawn, _EventScene):
-    """A system with events, and what a run needs besides a stepper and a step size.
+    """A system with events, with all data of a run except stepper and step size.
 
     Attributes:
         system, params: the system and its parameters.
@@ -89,7 +89,7 @@ class EventScene(_Drawn, _EventScene):
 
 @shown
 class InternalScene(_Drawn, _InternalScene):
-    """A system with internal states, and what a run needs besides a stepper and a step size.
+    """A system with internal states, with all data of a run except stepper and step size.
 
     Attributes:
         system, params: the system and its parameters.
@@ -103,7 +103,7 @@ class InternalScene(_Drawn, _InternalScene):
 
 
 def array(values: PyTree) -> Array:
-    """An array of floats; of numbers by NumPy, which has nothing to compile."""
+    """An array of floats. Known values are converted by NumPy, because NumPy compiles nothing."""
     dtype = jnp.result_type(float)
     known = all_concrete(values)
     return jnp.asarray(np.asarray(values, dtype) if known else values, dtype)

@@ -1,15 +1,15 @@
-"""A body on a table that shakes: it rides on the table, is thrown off, flies, and lands for the next ride.
+"""A body on a shaking table: it rides on the table, is thrown off, flies, and lands on the table again.
 
     m y'' = -m g + L,   riding: y = A sin(W t), L >= 0,   in flight: L = 0,   landing: y' becomes that of the table
 
-One run, in which events switch a constraint on and off. The number of constraints of a run is fixed, so where this one
-is off it holds something else: a coordinate s of its own, which nothing moves, and which is 0 throughout.
+In this run events switch a constraint on and off. The number of constraints of a run is fixed. So while this one is
+off, it fixes a separate coordinate s instead, on which no force acts, and which is always 0.
 
     Phi = on (y - A sin(W t)) + (1 - on) s
 
-(`on` times the constraint alone would leave a multiplier without an equation; redundant="least_squares" takes that,
-with a singular value decomposition in each step.) The body leaves the table where its multiplier falls to zero,
-sin(W t) = g/(A W^2), and the rest of the motion is a parabola up to the next contact.
+(Without s, on (y - A sin(W t)) = 0 would leave a multiplier without an equation. redundant="least_squares" can solve
+that, with a singular value decomposition in each step.) The body leaves the table when its multiplier falls to zero, at
+sin(W t) = g/(A W^2). Then it follows a parabola up to the next contact.
 J. Guckenheimer, P. Holmes, Nonlinear Oscillations, Dynamical Systems, and Bifurcations of Vector Fields, 1983, Ch. 2.4.
 """
 
@@ -28,43 +28,43 @@ GRAVITY = 9.81
 
 
 def mass(q, params: PyTree):
-    """M, a diagonal: of the body and of s, for which any will do."""
+    """M, a diagonal: the masses of the body and of s. That of s has no effect."""
     return params["m"] * jnp.ones(2, q.dtype)
 
 
 def weight(q, v, t, params: PyTree):
-    """Q; nothing moves s."""
+    """Q; no force acts on s."""
     return jnp.array([-params["m"] * params["g"], 0.0], q.dtype)
 
 
 def over_table(q, t, params: PyTree):
-    """Of the body, m."""
+    """Height of the body over the table, m."""
     return q[0] - params["A"] * jnp.sin(params["W"] * t)
 
 
 def contact(q, t, params: PyTree):
-    """Phi: the body on the table, or s at 0."""
+    """Phi: keeps the body on the table, or s at 0."""
     on = params["on"]
     return (on * over_table(q, t, params) + (1 - on) * q[1])[None]
 
 
 def before_landing(q, v, t, params: PyTree):
-    """Falls to zero where the body in flight meets the table."""
+    """A guard that falls to zero when the flying body meets the table."""
     return jnp.where(params["on"] == 1, 1.0, over_table(q, t, params))
 
 
 def before_leaving(q, v, t, params: PyTree, multipliers):
-    """Falls to zero where nothing presses the riding body onto the table any more."""
+    """A guard that falls to zero when the contact force of the riding body does."""
     return jnp.where(params["on"] == 1, multipliers[0], 1.0)
 
 
 def land(params: PyTree):
-    """The constraint on."""
+    """Switches the constraint on."""
     return params | {"on": 0 * params["on"] + 1}
 
 
 def leave(params: PyTree):
-    """The constraint off."""
+    """Switches the constraint off."""
     return params | {"on": 0 * params["on"]}
 
 
@@ -82,10 +82,10 @@ EVENTS = LANDING, LEAVING = Event(before_landing, reset=impact(0.0), switch=land
 
 
 def shaken_table(strength: float = 2.0) -> EventScene:
-    """Two flights in 1.3 s, from a ride at the table's mean height (SI units).
+    """Two flights in 1.3 s. The body starts on the table, at its mean height (SI units).
 
     Args:
-        strength: A W^2/g, the table's largest acceleration; beyond 1 it throws the body off.
+        strength: A W^2/g, the largest acceleration of the table over g; above 1 it throws the body off.
 
     >>> float(shaken_table().params["A"])
     0.1962

@@ -4,7 +4,7 @@ q = (crank angle, rod angle, slider position): angles from the x axis in rad, x 
 x = l1 cos q1 + l2 cos q2, the joint of crank and rod at l1 (cos q1, sin q1).
 
 Crank and rod are slender and uniform, of lengths l (2,) with l1 < l2; m (3,): masses of crank, rod and slider. Gravity
-g acts along -y. A spring k and a damper c act on the slider, the spring at rest at x = rest; a moment on the crank.
+g acts along -y. A spring k, at rest at x = rest, and a damper c act on the slider, and a moment on the crank.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def constraint(q: Array, t: Real, params: PyTree) -> Array:
 
 @drawings.Drawing
 def drawing(q, t, params: PyTree):
-    """Crank, rod and slider, which runs on the x axis; its spring, where there is one."""
+    """Crank, rod and slider, which runs on the x axis; its spring, if there is one."""
     l1 = params["l"][0]
     pin = l1 * np.array([np.cos(q[0]), np.sin(q[0])])
     wide, high = 0.1, 0.06
@@ -65,17 +65,17 @@ def drawing(q, t, params: PyTree):
 
 
 def free() -> Scene:
-    """No spring, no damper, no moment: the crank, stretched out at first, turns on from 20 rad/s."""
+    """No spring, no damper, no moment: the crank starts at 20 rad/s from the stretched position."""
     return _turning(20.0)
 
 
 def driven() -> Scene:
-    """From rest, stretched out: a moment of 5 N m on the crank, a spring and a damper on the slider."""
+    """From rest in the stretched position: a moment of 5 N m on the crank, a spring and a damper on the slider."""
     return _turning(0.0, moment=5.0, k=100.0, c=20.0)
 
 
 def _turning(speed: float, **loads: float) -> Scene:
-    """Stretched out, q = (0, 0, l1 + l2), with the crank at `speed`, rad/s."""
+    """The scene from the stretched position, q = (0, 0, l1 + l2), with the crank at `speed`, rad/s."""
     l1, l2 = 0.15, 0.45
     params = {"m": (0.5, 1.0, 0.8), "l": (l1, l2), "g": GRAVITY, "rest": l2}
     params |= {"moment": 0.0, "k": 0.0, "c": 0.0} | loads

@@ -1,11 +1,11 @@
 """Andrews' squeezing mechanism: seven bodies, seven angles, six constraints. SI units.
 
-A constant moment turns the crank K1. Its coupler K2 ends in a joint P, which carries three more branches: K3, held by
-a spring from its pivot B; K4 on K5; and K6 on K7, both pivoted at A.
+A constant moment turns the crank K1. Its coupler K2 ends in a joint P, which connects three more branches: K3, which
+is pivoted at B and held by a spring; K4 on K5; and K6 on K7. K5 and K7 are pivoted at A.
 
-q = (beta, theta, gamma, phi, delta, omega, epsilon), rad: of K1, of K2 relative to K1, of K3, of K4 relative to K5, of
-K5, of K6 relative to K7, and of K7. Lengths, masses m and moments of inertia I (7,), and pivots A, B, C have the
-names of the test set; c0 (N/m) and l0 (m) are of the spring, whose other end is C.
+q = (beta, theta, gamma, phi, delta, omega, epsilon): the angles in rad of K1, of K2 relative to K1, of K3, of K4
+relative to K5, of K5, of K6 relative to K7, and of K7. Lengths, masses m and moments of inertia I (7,), and the pivots
+A, B, C have the names of the test set. c0 (N/m) and l0 (m) are stiffness and rest length of the spring from K3 to C.
 
 References:
     Schiehlen (ed.), Multibody Systems Handbook (1990); Mazzia, Magherini, Test Set for IVP Solvers (2008), problem
@@ -33,7 +33,7 @@ def along(angle: Array) -> Array:
 
 
 def across(angle: Array):
-    """The same, turned by a right angle."""
+    """The vector of `along`, turned by a right angle."""
     return jnp.stack([-jnp.sin(angle), jnp.cos(angle)])
 
 
@@ -46,7 +46,8 @@ def mass(q: Array, params: PyTree) -> Array:
     e, ea, zt, zf, fa, u, ua, ub = itemgetter("e", "ea", "zt", "zf", "fa", "u", "ua", "ub")(params)
 
     def two_bars(inner: Array, outer: Array, coupling: Array):
-        """M of inner, both and outer bar, from the inertias about pivot and joint; the joint carries the outer mass."""
+        """The entries M11, M12 and M22 of an inner and an outer bar. inner, outer: inertias about pivot and joint; inner
+        includes the outer mass at the joint."""
         return inner + 2 * coupling + outer, outer + coupling, outer
 
     K1, K12, K2 = two_bars(I1 + m1 * ra**2 + m2 * rr**2, I2 + m2 * da**2, -m2 * rr * da * jnp.cos(theta))
@@ -77,7 +78,7 @@ def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
     rr, da, e, ea, zt, zf, fa, u = itemgetter("rr", "da", "e", "ea", "zt", "zf", "fa", "u")(params)
 
     def two_bars(slope: Array, inner: Array, outer: Array):
-        """On the inner and the outer bar; slope is that of their coupling in M."""
+        """Inertia forces on the inner and the outer bar; slope: the derivative of their coupling in M."""
         return -slope * outer * (outer + 2 * inner), slope * inner**2
 
     K1, K2 = two_bars(m2 * rr * da * jnp.sin(theta), beta_dot, theta_dot)
@@ -87,7 +88,7 @@ def force(q: Array, v: Array, t: Real, params: PyTree) -> Array:
 
 
 def constraint(q: Array, t: Real, params: PyTree) -> Array:
-    """Phi: P as the end of K2, less P as the end of K3, of K4 on K5, and of K6 on K7; two components each."""
+    """Phi: P as the end of K2, minus P as the end of K3, of K4 on K5, and of K6 on K7; two components each."""
     beta, theta, gamma, phi, delta, omega, epsilon = q
     rr, d, ss, e, zt, zf, u, A, B = itemgetter("rr", "d", "ss", "e", "zt", "zf", "u", "A", "B")(params)
     P = rr * along(beta) - d * along(beta + theta)
@@ -102,7 +103,7 @@ def constraint(q: Array, t: Real, params: PyTree) -> Array:
 
 @drawings.Drawing
 def drawing(q, t, params: PyTree):
-    """The bars, K1 and K2 first, in the order of their branches, and the spring."""
+    """The bars, branch by branch, starting with K1 and K2; and the spring."""
     beta, theta, gamma, _, delta, _, epsilon = q
     A, B, C = (params[x] for x in "ABC")
 
@@ -125,15 +126,15 @@ def drawing(q, t, params: PyTree):
 
 
 def squeezer(moment: float = 0.033) -> Scene:
-    """From rest, under a constant moment on the crank, N m; two and a half turns in 0.03 s with the default one.
+    """From rest under a constant moment on the crank. With the default moment it turns two and a half times in 0.03 s.
 
-    q0 closes the loops for the lengths of the test set, and no others.
+    q0 closes the loops only for the lengths of the test set.
 
     Args:
-        moment: on the crank, N m.
+        moment: moment on the crank, N m.
 
     Raises:
-        TypeError, ValueError: moment is no finite number.
+        TypeError, ValueError: moment is not a finite number.
     """
     params = {
         "m": array([0.04325, 0.00365, 0.02373, 0.00706, 0.07050, 0.00706, 0.05498]),

@@ -1,13 +1,14 @@
 """The spinning top of Cardona, Geradin (1989), Sec. 4.2: a disk on a massless rod that turns freely about the origin.
 
-The disk, of mass m (kg) and radius a (m), sits at the distance l (m) along material axis 2, about which it spins.
-Gravity g (m/s^2) is along -z. Om is the material angular velocity (rad/s), I the inertia about the disk's centre,
-J = I + m l^2 diag(1, 0, 1) that about the origin (kg m^2).
+The disk of mass m (kg) and radius a (m) is at the distance l (m) along material axis 2, about which it spins. Gravity g
+(m/s^2) is along -z. Om is the material angular velocity (rad/s). I is the inertia about the centre of the disk, and
+J = I + m l^2 diag(1, 0, 1) the inertia about the origin (kg m^2).
 
     minimal      q = R            J A = l e2 x R^T (-m g e3) - Om x J Om
     constrained  q = {R, x}       m xddot = -m g e3 + L,   I A = -Om x I Om - l e2 x R^T L,   Phi = x - l R e2 = 0
 
-The first needs 3 unknowns a step and the second 9, or 12 when stabilised. L (N) is the force of the rod on the disk.
+The first needs 3 unknowns per step. The second needs 9, or 12 with `formulation="ggl"`. L (N) is the force of the rod
+on the disk.
 """
 
 from __future__ import annotations
@@ -75,28 +76,28 @@ def drawing_minimal(R, t, params: PyTree):
 
 @drawings.Drawing
 def drawing_constrained(q, t, params: PyTree):
-    """The same, where the disk is."""
+    """The rod, and the disk at its own position."""
     return [drawings.bar(np.zeros(3), q["x"]), drawings.wheel(q["x"], params["a"], q["R"][:, 0], q["R"][:, 2])]
 
 
 def minimal(spin: float = 150.0, inclination: float = 0.0) -> Scene:
     """The top as a rotation alone.
 
-    It starts with its rod horizontal, along y, turning about the vertical at just the rate that takes it through its
-    lowest point: Om = spin (0, 1, -2 a^2/(a^2 + 4 l^2)).
+    By default it starts with its rod horizontal, along y. It turns about the vertical at exactly the rate with which it
+    later passes its lowest point: Om = spin (0, 1, -2 a^2/(a^2 + 4 l^2)).
 
     Args:
-        spin: about the rod, in rad/s. inclination: of the rod above the horizontal, in rad.
+        spin: angular velocity about the rod, in rad/s. inclination: angle of the rod above the horizontal, in rad.
 
     Raises:
-        TypeError, ValueError: an argument is no finite number.
+        TypeError, ValueError: an argument is not a finite number.
     """
     params, R, Om = _start("minimal", spin, inclination)
     return Scene(System(inertia, moment), params, array(R), array(spin * Om), DURATION, drawing_minimal)
 
 
 def constrained(spin: float = 150.0, inclination: float = 0.0) -> Scene:
-    """The same as a free disk, its centre held by the rod: 6 coordinates, 3 constraints.
+    """The same motion as a free disk whose centre the rod constrains: 6 coordinates, 3 constraints.
 
     Args:
         spin, inclination: as in `minimal`.

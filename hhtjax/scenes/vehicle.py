@@ -2,16 +2,16 @@
 
 q = (z, pitch, roll, u_1 ... u_4): heave of the body's centre of mass, its pitch (nose down) and roll (left side up),
 both small angles in rad, and the heights of the wheels: front left, front right, rear left, rear right. All are
-measured from static equilibrium on flat road, where the springs carry the weight: so gravity drops out.
+measured from static equilibrium on flat road, where the springs carry the weight. So the equations contain no gravity.
 
-A corner of the body, x forward and y to the left of the centre of mass, is at z - x pitch + y roll, and its suspension
-is compressed by d = u - (z - x pitch + y roll). It pushes the body up and the wheel down by
+A corner of the body, x forward and y to the left of the centre of mass, is at the height z - x pitch + y roll. Its
+suspension is compressed by d = u - (z - x pitch + y roll). It pushes the body up and the wheel down by
 
     S = k d + k3 d^3 + c v0 s (1 - r s),    s = d' / sqrt(v0^2 + d'^2)
 
 so the damper has the slope c at rest, saturates beyond the speed v0, and is (1 + r)/(1 - r) times as strong in rebound
-as in bump. The tyre pushes the wheel up by k_tyre (road - u). It is linear and pulls too: keep to rides on which no
-tyre is relieved of all its static load, as on the default one.
+as in bump. The tyre pushes the wheel up by k_tyre (road - u). It is linear, so it can also pull. The model is valid
+only while no tyre loses all of its static load, as on the default ride.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def mass(q: Array, params: PyTree) -> Array:
 
 
 def corner_heights(q: Array, params: PyTree) -> Array:
-    """Heights of the body's four corners, (4,); of v in the place of q, their rates."""
+    """Heights of the four corners of the body, (4,); with v instead of q, their rates."""
     return q[0] - params["x"] * q[1] + params["y"] * q[2]
 
 
@@ -57,7 +57,7 @@ def damper(rate: Real, params: PyTree) -> Array:
 
 
 def tyre(u: Array, t: Real, params: PyTree) -> Array:
-    """k_tyre (road - u): the wheel loads less the static ones."""
+    """k_tyre (road - u): the wheel loads minus the static ones."""
     return params["k_tyre"] * (params["road"](t) - u)
 
 
@@ -80,14 +80,14 @@ def road(
         Gd(n) = roughness (n / 0.1 m^-1)^-2,        bump (1 - cos(2 pi x / BUMP_LENGTH)) / 2
 
     The bump spans both tracks; the waves of the two are independent of each other. The rear wheels follow the front
-    ones at the wheelbase. The road begins flat, and its waves grow to their full height over RUN_UP. A wave has no
-    less than 8 samples, which a cubic spline follows closely.
+    ones at the wheelbase. The road begins flat, and its waves grow to their full height over RUN_UP. A wave has at
+    least 8 samples, so that a cubic spline follows it closely.
 
     Args:
         speed: in m/s, in [1, 40]. duration: in s, at least 3 sampling periods.
         roughness: Gd at 0.1 m^-1, in m^3: 16e-6 for class A, 64e-6 for B, 256e-6 for C; 0 for no waves.
         bump: height in m; negative for a dip, 0 for none.
-        seed: of the phases. wheelbase: in m, positive.
+        seed: seed of the random phases. wheelbase: in m, positive.
 
     Raises:
         TypeError, ValueError: an argument of the wrong kind or out of its range.
@@ -109,7 +109,7 @@ def road(
     ):
         require_number("road", name, value, valid, expectation)
     samples, step = round(duration / SAMPLING_PERIOD) + 1, speed * SAMPLING_PERIOD
-    period = max(samples, int(np.ceil(LONGEST / step)))  # the waves repeat after so many samples
+    period = max(samples, int(np.ceil(LONGEST / step)))  # number of samples after which the waves repeat
     behind = np.array([0.0, wheelbase])
 
     n = np.fft.rfftfreq(period, step)
@@ -135,7 +135,7 @@ def road_at(road, t):
 @drawings.Drawing
 def drawing(q, t, params: PyTree):
     """The body as a plate, with springs to the wheels, and the road under each wheel; heights are to scale."""
-    high, r = 0.7, 0.3  # of the body over the ground, and of a wheel, m
+    high, r = 0.7, 0.3  # height of the body over the ground, and radius of a wheel, m
     x, y = params["x"], params["y"]
     corners = np.stack([x, y, high + q[0] - x * q[1] + y * q[2]], axis=-1)
     centres = np.stack([x, y, r + q[3:]], axis=-1)
@@ -152,15 +152,15 @@ def drawing(q, t, params: PyTree):
 def ride(
     speed: float = 10.0, duration: Real = 4.0, roughness: float = 64e-6, bump: float = 0.05, seed: int = 0
 ) -> Scene:
-    """A mid-size car from rest over the `road` of these arguments.
+    """A mid-size car on the `road` with these arguments. It starts in static equilibrium.
 
     params: body (3,), sprung mass and pitch and roll inertia; wheel, x, y, k, c, k_tyre (4,), in the order of the
     wheels; k3, v0, r; road, a `hhtjax.sampled` signal of the four heights.
 
     Args:
-        speed: m/s. duration: s.
-        roughness: of the road, m^3. bump: its height half way, m.
-        seed: of the road.
+        speed: speed of the car, m/s. duration: duration of the run, s.
+        roughness: roughness of the road, m^3. bump: height of the bump halfway, m.
+        seed: seed of the road.
 
     Raises:
         TypeError, ValueError: as `road`.

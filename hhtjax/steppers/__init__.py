@@ -35,8 +35,9 @@ stepper                            order                 solves per step   for
 All of them also solve a first-order system, `FirstOrderSystem(rate)` with `rate(y, t, params)`; the solution's `q` is
 y. Constraints and rotations: the `hht` family and `extrapolated`; also `conventional_hht`, in the form its authors
 printed. Internal states: the `hht` family, `extrapolated`, Rosenbrock and Runge-Kutta methods and `taylor`. Dry
-friction and contact: the `hht` family. `implicit_euler` supports the same features as the `hht` family, except error
-control.
+friction and contact: the `hht` family. Events: the `hht` family, Rosenbrock and Runge-Kutta methods and `taylor`. Error
+control: the same without `rk4`, and `extrapolated`. `implicit_euler` supports the same features as the `hht` family,
+except error control.
 
 Some terms. A motion is stiff if it contains vibrations or decays much faster than those of interest, such as those of
 stiff springs. A method is A-stable if no step size makes a decaying linear motion grow. It is L-stable if it also
