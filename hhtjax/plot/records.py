@@ -84,7 +84,7 @@ def fit_against_data(
 
 
 def densities(ax, records: dict, rate: float, unit: str | None, frequency_unit: str):
-    """Draws spectra of records by name: the residual in blue, measurements in grey."""
+    """Draws spectra of records, {name: values}: the residual in blue, measurements in grey."""
     for name, values in records.items():
         frequency, density = _spectrum(values, rate)
         colour = COLOURS[0] if name == "residual" else MEASURED

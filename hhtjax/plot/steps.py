@@ -22,7 +22,7 @@ def spectral_radius(steppers: Any, *, frequency: Any = None, damping: float = 0.
         rho = max |eigenvalue of A|,    A: see `hhtjax.analysis.oscillator_matrix`
 
     Args:
-        steppers: a stepper, or several by name, {label: stepper}.
+        steppers: a stepper, or a dict of several, {label: stepper}.
         frequency: w h, natural frequency times step size in rad, a vector of positive numbers; by default 0.01 to 1000.
         damping: the damping ratio of the oscillator.
         ax: axes to draw into; None for a new figure.
@@ -131,7 +131,7 @@ def stability_region(
         stable: |eigenvalue| <= 1 for all eigenvalues of the step, as in `hhtjax.analysis.stability_region`
 
     Args:
-        steppers: a stepper, or several by name, {label: stepper}.
+        steppers: a stepper, or a dict of several, {label: stepper}.
         real, imag: (smallest, largest), the range of the real and of the imaginary axis.
         points: number of points in each direction, at least 2. The edge is interpolated between them.
         ax: axes to draw into; None for a new figure.

@@ -251,7 +251,7 @@ def _read_off(problem: Problem, times: Array, dt: Array, events, *, room: tuple)
         t0, times, dt = map(problem.times, (problem.t0, times, dt))
         return follow(problem, times, EqualSteps.to(t0, times, dt), events, room)._replace(dt=dt)
 
-    return one_kernel(run, problem, times, dt, events, around=True)  # what comes before and behind the loop too
+    return one_kernel(run, problem, times, dt, events, around=True)  # also what comes before and after the loop
 
 
 @partial(Programs, static_argnames=("room",))

@@ -427,7 +427,7 @@ def first_bad(bad):
 def bad_samples(t: np.ndarray, dt: np.ndarray):
     """The message for bad times or steps of a run under error control: times (..., K + 1), and dt NaN after the last
     step."""
-    if not np.all(np.diff(t) >= 0):  # behind an event that ends the run they are its end
+    if not np.all(np.diff(t) >= 0):  # after an event that ends the run, times repeat
         return ORDER.format(t)
     return ALIKE.format(t.dtype, t.flat[0]) if np.any(dt == 0) else None
 

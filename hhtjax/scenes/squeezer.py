@@ -46,8 +46,8 @@ def mass(q: Array, params: PyTree) -> Array:
     e, ea, zt, zf, fa, u, ua, ub = itemgetter("e", "ea", "zt", "zf", "fa", "u", "ua", "ub")(params)
 
     def two_bars(inner: Array, outer: Array, coupling: Array):
-        """The entries M11, M12 and M22 of an inner and an outer bar. inner, outer: inertias about pivot and joint; inner
-        includes the outer mass at the joint."""
+        """The entries M11, M12 and M22 of an inner and an outer bar. inner, outer: inertias about pivot and joint;
+        inner includes the outer mass at the joint."""
         return inner + 2 * coupling + outer, outer + coupling, outer
 
     K1, K12, K2 = two_bars(I1 + m1 * ra**2 + m2 * rr**2, I2 + m2 * da**2, -m2 * rr * da * jnp.cos(theta))

@@ -391,7 +391,7 @@ def _changed(system: FlatSystem, event: Event, params: PyTree, at: tuple):
         return [after[i] for i in places]
 
     jaxpr = jax.make_jaxpr(after)([leaves[i] for i in places], *at).jaxpr
-    pairs = zip(places, jaxpr.invars, jaxpr.outvars, strict=False)  # behind the params is the state
+    pairs = zip(places, jaxpr.invars, jaxpr.outvars, strict=False)  # the state follows the params
     return [i for i, before, after in pairs if after is not before]
 
 

@@ -91,10 +91,9 @@ def consistent_initial(
         redundant: "least_squares" for constraints that may depend on each other, as in `hht`.
         z0: internal states, if the system has any. They enter the forces and do not change.
 
-    The search for q takes steps that descend both towards the constraints and towards q0. Newton's method alone would
-    end at an arbitrary point when it starts far away. If the constraints are curved on the way, the result is the
-    nearest of up to 24 searches. A nearer point may exist; `moved` is the distance. Differentiable, forward and
-    reverse. Under jit nothing is raised: look at `converged`.
+    The search for q approaches both the constraints and q0. Newton's method alone would end at an arbitrary point when
+    it starts far away. If the constraints are curved on the way, the result is the nearest of up to 24 searches. A nearer point may exist; `moved` is the distance. Differentiable, forward and
+    reverse. Under jit no error is raised: check `converged`.
 
     Returns:
         A `ConsistentInitial`.
