@@ -92,8 +92,9 @@ def consistent_initial(
         z0: internal states, if the system has any. They enter the forces and do not change.
 
     The search for q approaches both the constraints and q0. Newton's method alone would end at an arbitrary point when
-    it starts far away. If the constraints are curved on the way, the result is the nearest of up to 24 searches. A nearer point may exist; `moved` is the distance. Differentiable, forward and
-    reverse. Under jit no error is raised: check `converged`.
+    it starts far away. If the constraints are curved on the way, the result is the nearest of up to 24 searches. A
+    nearer point may exist; `moved` is the distance. Differentiable, forward and reverse. Under jit no error is raised:
+    check `converged`.
 
     Returns:
         A `ConsistentInitial`.
