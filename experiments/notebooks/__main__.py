@@ -18,7 +18,7 @@ from nbclient.exceptions import CellExecutionError
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 LARGEST = 400_000  # bytes of a rendered notebook
-LONGEST = 120  # s, of a cell
+LONGEST = 240  # s, of a cell: twice what the longest takes where two notebooks and the tests share two cores
 WAITING = "hhtjax: tracing or compiling"  # a line for who waits, not for who reads
 METADATA = {
     "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
