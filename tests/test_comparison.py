@@ -219,7 +219,7 @@ def test_a_summary_says_what_the_residuals_are_worth():
 
     result = hhtjax.fit(residuals, {"a": 0.1, "b": 0.1}, weights={"u": weights})
     text = result.summary()
-    assert "observations: 1500 and 100 missing, worth " in text
+    assert "observations: 1500 and 100 missing, as informative as " in text
     r = np.asarray(result.residual["u"])[present]
     assert f"residual: rms u {np.sqrt(np.mean(r**2)):.4g}; " in text
     assert f"weighted sum of squares {4 * np.sum(r**2) / 1498:.3g} per degree of freedom" in text
@@ -227,7 +227,7 @@ def test_a_summary_says_what_the_residuals_are_worth():
     assert "not white (Ljung-Box, 20 lags: p = 0)" in text
     assert "largest correlation: -1.000 between a and b" in text
     assert float(text.rpartition("condition number of the scaled Jacobian: ")[2]) > 100
-    worth = float(text.partition("worth ")[2].split()[0])
+    worth = float(text.partition("as informative as ")[2].split()[0])
     u = result.uncertainty
     assert worth == pytest.approx(1500 * 2 / np.trace(np.linalg.solve(u.naive, u.cluster)), rel=0.02)
 

@@ -198,7 +198,7 @@ def test_a_start_without_influence_is_no_best_one():
     found = hhtjax.multistart(residuals, jnp.array([-1.0, 1.0]))
     assert float(found.best.params) == pytest.approx(5 / 3)
     for question in (lambda x: x.standard_errors, lambda x: x.reason, lambda x: x.interval(), lambda x: x.summary()):
-        with pytest.raises(ValueError, match=r"FitResult: must be of one fit; this is a batch, of shape \(2,\)"):
+        with pytest.raises(ValueError, match=r"FitResult: must hold one fit; received a batch of shape \(2,\)"):
             question(found.all)
     member = jax.tree.map(lambda x: x[1], found.all)
     assert member.summary().splitlines()[2] == found.best.summary().splitlines()[2]
