@@ -154,5 +154,6 @@ def page(paper, found):
 
 
 if __name__ == "__main__":
+    found = numbers()
     for paper in PAPERS:
-        (HERE / paper).write_text(page(paper, numbers()))
+        (HERE / paper).write_text(page(paper, found))
