@@ -200,6 +200,9 @@ def test_loops_that_cannot_be_closed_are_refused():
         tree([one], loops=[Connect("world", "bar")])
     with pytest.raises(ValueError, match="`loops` names 'rod'"):
         tree([one], loops=[Connect("world", "rod")])
+    pin = Body("pin", "bar", Joint("revolute", friction=0.1), position=(1.0, 0, 0))
+    with pytest.raises(ValueError, match="the joint 'pin' of `bodies` must move some inertia"):
+        tree([one, pin], loops=[Weld("pin", "world", anchor2=(1.0, 0, 0))])
 
 
 def test_couplings_hold_and_weld():

@@ -52,6 +52,21 @@ def test_bad_input_is_named(error, message, call):
         call()
 
 
+def test_friction_without_mass_is_named():
+    """Constraints may tie a coordinate without mass to others, but what rubs needs some mass of its own."""
+    system = hhtjax.System(
+        np.array([1.0, 0.0]),
+        force,
+        constraint=lambda q, t, params: q[:1] - q[1:],
+        friction=lambda q, v, L, t, params: jnp.array([0.1]),
+        sliding=lambda q, v, t, params: v[1:],
+    )
+    with pytest.warns(hhtjax.FailedRunWarning):
+        run = simulate(system)
+    with pytest.raises(hhtjax.SimulationError, match="`mass` must be positive where dry friction acts"):
+        run.check()
+
+
 def test_seventeen_joints_are_too_many():
     system = hhtjax.System(jnp.ones(17), force, friction=limit)
     with pytest.raises(ValueError, match="at most 16 directions; received one for each of 17 coordinates"):

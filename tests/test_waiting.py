@@ -19,6 +19,7 @@ from hhtjax.xla import Programs, first_call
 @pytest.fixture(autouse=True)
 def _little_patience(monkeypatch):
     monkeypatch.setattr(first_call, "PATIENCE", 0.15)
+    monkeypatch.setattr(first_call, "LATER", 0.15)
 
 
 def told(caplog):
@@ -161,6 +162,20 @@ def test_in_a_terminal_an_error_wipes_the_line_out_and_logging_keeps_it_quiet(te
 
 
 @pytest.mark.slow
+def test_after_the_first_message_only_much_longer_calls_are_told_of(caplog, monkeypatch):
+    monkeypatch.setattr(first_call, "_logged", [])
+    monkeypatch.setattr(first_call, "LATER", 20.0)
+    Programs(slow_to_trace(0.4))(jnp.ones(2))
+    assert len(told(caplog)) == 1
+    Programs(slow_to_trace(0.4))(jnp.ones(2))
+    assert not told(caplog)
+    monkeypatch.setattr(first_call, "LATER", 0.2)
+    Programs(slow_to_trace(0.4))(jnp.ones(2))
+    (line,) = told(caplog)
+    assert "for 0.2 s by now" in line
+
+
+@pytest.mark.slow
 def test_logging_keeps_quiet(caplog):
     with caplog.at_level(logging.ERROR, logger="hhtjax"):
         Programs(slow_to_trace(0.4))(jnp.ones(3))
@@ -172,9 +187,9 @@ def test_how_to_wait_less_is_said_once_and_where_nothing_is_kept(monkeypatch):
     folder = jax.config.jax_compilation_cache_dir
     try:
         jax.config.update("jax_compilation_cache_dir", "somewhere")
-        assert "keep_programs" not in first_call._words()
+        assert "keep_programs" not in first_call._words(2.0)
         jax.config.update("jax_compilation_cache_dir", None)
-        assert ["keep_programs" in first_call._words() for _ in range(3)] == [True, False, False]
+        assert ["keep_programs" in first_call._words(2.0) for _ in range(3)] == [True, False, False]
     finally:
         jax.config.update("jax_compilation_cache_dir", folder)
 

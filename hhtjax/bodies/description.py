@@ -218,13 +218,19 @@ def _inertia(name: str, inertia: Any, mass: float) -> tuple:
         raise ValueError(f"Body: `inertia` of {name!r} must be symmetric; received {inertia!r}.")
     x = (x + x.T) / 2
     moments = np.linalg.eigvalsh(x)
-    if moments[0] < -1e-12 * moments[2] or moments[2] > moments[0] + moments[1] + 1e-6 * moments[2]:
+    if np.any(x) and mass == 0:
+        raise ValueError(
+            f"Body: {name!r} has inertia but no mass. Give `mass`. If only the inertia about the axis of its joint is "
+            "known, leave `inertia` out and give `armature` of the joint instead."
+        )
+    above = moments[2] - moments[1] - moments[0]
+    if moments[0] < -1e-12 * moments[2] or above > 1e-6 * moments[2]:
+        rounded = [float(f"{moment:.6g}") for moment in moments]
+        why = "the first is negative" if moments[0] < 0 else f"the last exceeds the sum of the others by {above:.3g}"
         raise ValueError(
             f"Body: `inertia` of {name!r} must be possible: principal moments >= 0, none larger than the "
-            f"sum of the others; received {moments.tolist()}."
+            f"sum of the others. The principal moments of {inertia!r} are {rounded}: {why}."
         )
-    if moments[2] > 0 and mass == 0:
-        raise ValueError(f"Body: {name!r} has inertia but no mass: give `mass`, or use the `armature` of a joint.")
     return tuple(x.ravel().tolist())
 
 

@@ -272,6 +272,7 @@ def _assembled(caller, bodies, motors, loops, markers, gravity, friction, limits
         params["restitution"] = _array(RESTITUTION)
     if model.loops:
         model, q0 = _closed(caller, model, q0, v0, params)
+        _require_inertia_of_friction(caller, model, parts, q0, params)
     else:
         _require_inertia(caller, model, parts, q0, params)
     if free and model.rows is not None:
@@ -455,6 +456,20 @@ def _require_inertia(caller: str, model: Model, parts: Structure, q0: PyTree, pa
             f"{caller}: the joint{'s' * (len(names) > 1)} {', '.join(names)} of `bodies` can move without moving a "
             "mass, so the mass matrix is singular: give the attached bodies mass and inertia, or the joint an "
             "`armature`."
+        )
+
+
+def _require_inertia_of_friction(caller: str, model: Model, parts: Structure, q0: PyTree, params: dict):
+    """Raises an error that names joints with friction that move no mass. In a loop a joint may carry a body without
+    mass; but friction stops a joint by its inertia."""
+    M = numpy_mass_matrix(model, jax.tree.map(np.asarray, q0), params)
+    weak = [i for i in model.rubbing if not M[i, i] > 0]
+    names = [repr(name) for name, made in parts.joints.items() if set(weak) & set(made.rates)]
+    if names:
+        raise ValueError(
+            f"{caller}: the joint{'s' * (len(names) > 1)} {', '.join(names)} of `bodies` must move some inertia, since "
+            "friction acts there; what it carries has neither mass nor inertia. Give the joint a small `armature`, "
+            "such as 1e-5 kg m^2."
         )
 
 

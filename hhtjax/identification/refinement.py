@@ -14,9 +14,9 @@ import numpy as np
 from hhtjax.analysis import damping_ratio
 from hhtjax.checks import require_function, require_integer, require_number
 from hhtjax.description import PyTree, Real, freeze, thaw
-from hhtjax.description.presentation import shown
+from hhtjax.description.presentation import Table, as_text, shown
 from hhtjax.identification import report
-from hhtjax.identification.identifiability import parameter_names
+from hhtjax.identification.identifiability import parameter_names, parameter_values
 from hhtjax.identification.identify import fit
 from hhtjax.identification.result import NAMED, FitResult
 from hhtjax.runs.extrapolate import richardson
@@ -43,6 +43,8 @@ class Refined(NamedTuple):
         fits: a `FitResult` for each of dt, dt/2, ...
         params: the parameters extrapolated to dt = 0, by Richardson's method.
         shift: (fits[0].params - params) in standard errors of the first fit, a pytree like params.
+
+    `print(result)` or `result.summary()` shows them as a table.
     """
 
     stepper: Stepper
@@ -50,6 +52,23 @@ class Refined(NamedTuple):
     fits: tuple[FitResult, ...]
     params: PyTree
     shift: PyTree
+
+    @property
+    def standard_errors(self) -> PyTree:
+        """Standard errors of `params`: those of the last fit, which has the smallest step. A pytree like params."""
+        return self.fits[-1].standard_errors
+
+    def summary(self) -> str:
+        """Text: a table of the extrapolated estimates, their standard errors, and the shift by the first step size."""
+        return as_text(self._table())
+
+    def _table(self) -> Table:
+        steps = ", ".join(f"{self.dt / 2**level:.6g}" for level in range(len(self.fits)))
+        rows = report.table(self.fits[-1]._replace(params=self.params)).rows
+        shifts = (f"{x:+.2g}" for x in parameter_values(self.shift))
+        column = [f"shift with steps of {self.dt:.6g} s, in standard errors", *shifts]
+        title = f"Refined: extrapolated to dt = 0 from fits with steps of {steps} s"
+        return Table(title, [[*row, x] for row, x in zip(rows, column, strict=True)])
 
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """Confidence interval about `params`, with the standard errors of the last fit: two pytrees like params."""
@@ -109,7 +128,7 @@ def refine(
         progress: shows on stderr which fit is running, and below it the progress line of that fit.
 
     Returns:
-        A `Refined`.
+        A `Refined`, with `params`, `standard_errors`, `interval()` and `summary()`.
 
     Warns:
         StepSizeWarning: the step size shifts a parameter by more than one standard error. The warning names it.

@@ -116,7 +116,8 @@ def _about_residuals(result: FitResult):
     if any(np.asarray(w).dtype != bool for w in jax.tree.leaves(result.weights)) and n > unknowns:
         square = sum(np.sum(r**2) for r in residuals.weighted)
         words.append(f"weighted sum of squares {square / (n - unknowns):.3g} per degree of freedom")
-    if found := whiteness(residuals):
+    found = whiteness(residuals) if result.uncertainty is not None else None  # a design has no noise
+    if found:
         rho, p, lags = found
         words.append(f"correlation at lag 1 {rho:+.2f}")
         words.append(f"{'' if p > 0.05 else 'not '}white (Ljung-Box, {lags} lags: p = {p:.2g})")

@@ -109,7 +109,10 @@ class FitResult(NamedTuple):
         return jnp.zeros((p, p), covariance.dtype).at[np.ix_(at, at)].set(covariance)
 
     def errors(self, covariance: Array) -> PyTree:
-        """Standard errors, structured like params, from a covariance of the fitted entries."""
+        """Standard errors, structured like params, from a covariance of the fitted entries.
+
+        `result.errors(result.uncertainty.naive)` are those for white noise.
+        """
         _, unravel = ravel_pytree(freeze(self.params))
         return thaw(unravel(jnp.sqrt(jnp.diagonal(self.embed(covariance)))))
 

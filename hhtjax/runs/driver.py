@@ -18,6 +18,7 @@ from hhtjax.description import Array, PyTree, thaw
 from hhtjax.jaxpr import on_scalars
 from hhtjax.numerics.batched_cond import if_any, tree_where
 from hhtjax.numerics.checkpointed_scan import checkpoint
+from hhtjax.numerics.dense_lu import diagonal
 from hhtjax.primitives import in_turn
 from hhtjax.runs.event_step import EventContext, EventState, Pieces, SubStep, asks, pass_events, reaching, unnoted
 from hhtjax.runs.solution import FINE, INTERNAL_STATE, ContactForces, Failure, Log, Solution
@@ -27,7 +28,8 @@ from hhtjax.steppers.variable_step import resized_step
 from hhtjax.systems import zero_order_hold
 from hhtjax.systems.contact_start import start_flaws
 from hhtjax.systems.events import flatten_events
-from hhtjax.systems.matrices import OF_VELOCITY, mass_flaw
+from hhtjax.systems.friction import directions
+from hhtjax.systems.matrices import OF_VELOCITY, RUBBED, mass_flaw
 from hhtjax.systems.system import mass_reads_velocity
 
 if TYPE_CHECKING:
@@ -227,10 +229,16 @@ def with_flaw(failure: Failure, flaw: Array | None) -> Failure:
 
 
 def flaw_at_start(system, flat, start, params: PyTree):
-    """What is wrong with the mass at the start, if it is a function; a constant mass has been checked before."""
-    if not callable(getattr(system, "mass", None)):
+    """What is wrong with the mass at the start, if it is a function; a constant mass has been checked before. With
+    constraints a coordinate may have no mass, unless friction acts there."""
+    rubs = flat.friction is not None and flat.num_constraints > 0
+    if not callable(getattr(system, "mass", None)) and not rubs:
         return None
-    flaw = mass_flaw(flat.mass(start.q, start.t, params), system.constraint is not None or system.massless is not None)
+    M = flat.mass(start.q, start.t, params)
+    flaw = mass_flaw(M, system.constraint is not None or system.massless is not None)
+    if rubs:
+        rubbed = jnp.any(directions(flat, start.q, start.t, params) != 0, axis=0)
+        flaw = jnp.where((flaw == 0) & jnp.any(rubbed & (diagonal(M) <= 0)), RUBBED, flaw)
     if not getattr(system.mass, "is_lagrangian", False):
         return flaw
     at = flat.unravel(start.q), flat.unravel_rates(flat.located(start.v)), start.t, thaw(params)

@@ -17,7 +17,7 @@ from hhtjax.steppers.friction_switching import DEPENDENT
 from hhtjax.steppers.stepper import Info
 from hhtjax.systems.constraints import SWITCHED_OFF
 from hhtjax.systems.contact import Fault
-from hhtjax.systems.matrices import INDEFINITE, MASSLESS, OF_VELOCITY
+from hhtjax.systems.matrices import INDEFINITE, MASSLESS, OF_VELOCITY, RUBBED
 
 if TYPE_CHECKING:
     from hhtjax.runs.error_control import Steps
@@ -78,7 +78,8 @@ class Failure(NamedTuple):
         friction: `info.friction` if it was too large, else 0; None without dry friction.
         mass: what is wrong at the start with a mass that is a function: 0 nothing, 1 it is not symmetric, 2 not
             positive definite (with constraints: not positive semidefinite), 3 it depends on velocities (only for
-            `from_lagrangian`); None if the mass is constant.
+            `from_lagrangian`), 4 it is 0 in a coordinate with dry friction. None if the mass is constant, unless there
+            are constraints and friction.
         event: what went wrong at an event, 0 nothing; None without events. guard: the number of that event.
         contact: `info.contact`, what went wrong with contacts, 0 nothing; None without contacts.
     """
@@ -123,7 +124,7 @@ QUANTITIES = (
     "the position q", "the velocity v", "the acceleration", "the vector of multipliers",
     "the internal state z", "the rate of the internal state z",
 )  # fmt: skip
-MASS = (None, "symmetric", "positive definite", "the same at all velocities")
+MASS = (None, "symmetric", "positive definite", "the same at all velocities", "positive where dry friction acts")
 CONTACT = {  # what went wrong with contacts
     Fault.NO_FORCES: "no contact forces satisfy the contact and friction laws: normal forces that push, friction "
     "within its limits. Take a smaller dt, or less `friction`",
@@ -141,6 +142,7 @@ CONTACT = {  # what went wrong with contacts
 WAYS = {
     INDEFINITE: f". {MASSLESS}",
     OF_VELOCITY: ": from_lagrangian needs a kinetic energy quadratic in v. For others write a System(mass, force)",
+    RUBBED: ". Give the coordinates with friction a small mass or inertia; with hhtjax.bodies, `armature` of the joint",
 }
 INTERNAL_STATE = 4  # the index of z in QUANTITIES
 

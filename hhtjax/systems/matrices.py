@@ -203,7 +203,7 @@ def _require_sparse_mass(caller: str, name: str, M: Sparse):
         raise ValueError(f"{caller}: `{name}` must be symmetric; received one that differs from its transpose.")
 
 
-UNSYMMETRIC, INDEFINITE, OF_VELOCITY = 1, 2, 3  # what may be wrong with a mass
+UNSYMMETRIC, INDEFINITE, OF_VELOCITY, RUBBED = 1, 2, 3, 4  # what may be wrong with a mass
 
 
 def mass_flaw(M: Array | Sparse, massless: bool) -> Array:

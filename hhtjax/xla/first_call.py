@@ -189,6 +189,7 @@ def _look_through():
 # time so far, elsewhere one message by `logging`.
 
 PATIENCE = 2.0  # s
+LATER = 20.0  # s, after the first message by `logging`: a script may compile ten programs that take a few seconds each
 PERIOD = 0.25  # s between two checks whether the program is done; the line counts in seconds
 GOODBYE = 1.0  # s that the end of a call waits at most for the line to be closed
 COMPILED = "/jax/core/compile/backend_compile_duration"  # the event of JAX after a program was compiled, or loaded
@@ -196,6 +197,7 @@ LOG = logging.getLogger("hhtjax")  # without configuration it writes to stderr
 
 _clocks: dict[int, _Clock] = {}  # by thread
 _hinted: list[bool] = []
+_logged: list[bool] = []
 _watching: list[bool] = []
 
 
@@ -217,8 +219,9 @@ class _Clock:
 
     def run(self):
         """Runs until the program is compiled, or tracing or compilation has ended with an error."""
-        if not self.over.wait(PATIENCE) and self.is_needed():
-            self.tell()
+        patience = PATIENCE if _is_rewritable() or not _logged else LATER
+        if not self.over.wait(patience) and self.is_needed():
+            self.tell(patience)
         self.frame = None
         if _clocks.get(self.thread) is self:
             del _clocks[self.thread]
@@ -228,10 +231,11 @@ class _Clock:
         waited_for = self.frame
         return waited_for is not None and any(x is waited_for for x in _stack(sys._current_frames().get(self.thread)))
 
-    def tell(self):
-        """Shows the message, after two seconds."""
+    def tell(self, patience: float):
+        """Shows the message, after so many seconds."""
         if not _is_rewritable():
-            LOG.warning(_words())
+            LOG.warning(_words(patience))
+            _logged.append(True)
             while not self.over.wait(PERIOD) and self.is_needed():
                 pass  # one message is enough
             return
@@ -302,9 +306,9 @@ def _is_rewritable() -> bool:
     return alone and is_terminal() and LOG.isEnabledFor(logging.WARNING) and not LOG.hasHandlers()
 
 
-def _words() -> str:
+def _words(patience: float) -> str:
     """The message for `logging`."""
-    words = f"hhtjax: tracing or compiling a program for {PATIENCE:.3g} s by now; only its first call takes so long."
+    words = f"hhtjax: tracing or compiling a program for {patience:.3g} s by now; only its first call takes so long."
     return words + _hint(" ")
 
 
