@@ -93,7 +93,8 @@ class System(Description):
             Derivatives of single forces of dependent sticking joints are only correct in sum. Rows are treated as
             dependent if there are more of them than freedoms (n minus the rows of `constraint`), if there are more than
             8, or if the start shows that they are. `check()` reports rows whose dependence only shows in traced values,
-            or only later in the run; use `hht(redundant="least_squares")` for these.
+            or only later in the run; use `hht(redundant="least_squares")` for these. Each coordinate with friction
+            needs a positive mass, also where constraints carry it; `check()` says so.
         contact: a `Contact`: bodies in a plane that collide, rest, stick, slide and separate. For the `hht` family;
             `run.contact` holds the contact forces.
 
