@@ -157,6 +157,7 @@ def test_derivatives_in_entries_of_an_inertia_are_symmetric():
     np.testing.assert_allclose(slope, jnp.swapaxes(slope, 1, 2), rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradients_in_all_inertial_params():
     """Forward = reverse = central differences, through the closed slopes and their derivatives."""
     robot = random_tree(("revolute", "ball"), seed=5)
