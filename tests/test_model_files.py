@@ -495,7 +495,7 @@ def test_names_made_for_what_has_none_are_unique():
 def test_a_weld_that_lets_the_bodies_turn_is_a_connection_of_points():
     ties = '<equality><weld body1="a" body2="b" torquescale="{}" relpose="0.1 0.2 0.3 1 0 0 0" anchor="0.3 0 0"/></equality>'  # noqa: E501
     shape = '<freejoint/><geom size="0.1" contype="0" conaffinity="0"/>'
-    text = f'<mujoco><worldbody><body name="a">{shape}</body><body name="b" pos="1 0 0">{shape}</body></worldbody>{{}}</mujoco>'  # noqa: E501
+    text = f'<mujoco><worldbody><body name="a">{shape}</body><body name="b" pos="-0.1 0.2 0.3">{shape}</body></worldbody>{{}}</mujoco>'  # noqa: E501
     kinds = [bodies.load(text.format(ties.format(x))).model.loops[0].kind for x in (0, 0.5)]
     assert kinds == ["connect", "weld"]
     loose = bodies.load(text.format(ties.format(0)))
