@@ -160,8 +160,8 @@ class Solution(NamedTuple):
             whether all converged, constraint drift. A field is None if the method does not report it.
         failure: the first step that failed, a `Failure`; `check` turns it into an error.
         z, zdot: internal states and their rates, like z0 with a leading axis K + 1; None without internal states.
-        friction: tau (K + 1, m), dry friction, positive for positive sliding; None without dry friction. At the end of a
-            step in which a joint starts or stops to slide, it and the acceleration have an error of order dt.
+        friction: tau (K + 1, m), dry friction, positive for positive sliding; None without dry friction. At the end of
+            a step in which a joint starts or stops to slide, it and the acceleration have an error of order dt.
         sticking: (K + 1, m), whether a joint sticks; None without dry friction.
         contact: `ContactForces`; None without contacts.
         steps: the steps that error control chose, a `Steps`; dt then holds the accepted ones. None without error
