@@ -119,7 +119,7 @@ def test_robust_errors_with_eliminated_starts_are_those_of_the_dense_fit():
 def test_a_loss_without_curvature_has_no_standard_error():
     """Two clusters of residuals beyond the bend of the loss, at +-10: between them the cost is level."""
     data = jnp.where(jnp.arange(40) < 20, 10.0, -10.0)
-    with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match="error for params: most residuals are so large"):
+    with pytest.warns(hhtjax.identification.IdentifiabilityWarning, match="params: most residuals are so large"):
         result = hhtjax.fit(lambda p: p - data, 0.5, loss="huber")
     assert result.converged
     assert np.isinf(result.standard_errors)
