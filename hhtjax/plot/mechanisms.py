@@ -11,7 +11,7 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.animation import FuncAnimation
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator
 
 from hhtjax.bodies import Mechanism
 from hhtjax.checks import require_function, require_number
@@ -194,10 +194,11 @@ def _scene(caller: str, ax, frames: list, unit: str | None):
         if spatial:
             panel.set_box_aspect(size, zoom=0.8)
             for axis, length in zip((panel.xaxis, panel.yaxis, panel.zaxis), size / max(size), strict=True):
-                axis.set_major_locator(MaxNLocator(1 + int(5 * length)))
+                few = FixedLocator([round(float(np.mean(axis.get_view_interval())), 2)])  # two labels would overlap
+                axis.set_major_locator(MaxNLocator(1 + int(5 * length)) if length > 0.2 else few)
         else:
             panel.set_aspect("equal")
-            if size[0] < size[1] / 2:  # narrow: more labels would overlap
+            if size[0] < 0.8 * size[1]:  # narrow: more labels would overlap
                 panel.xaxis.set_major_locator(MaxNLocator(2))
         yield panel
 
