@@ -54,6 +54,15 @@ def test_predicted_bias_is_measured_and_taken_back(capfd):
     assert float(refined.params["c"]) == pytest.approx(C, rel=1e-3)
     by_two = richardson([fine.params, finest.params], 2)
     assert abs(by_two["c"] - C) > 5 * abs(refined.params["c"] - C)
+    assert refined.standard_errors == refined.fits[-1].standard_errors
+    title, header, *rows = refined.summary().splitlines()
+    assert "extrapolated to dt = 0" in title
+    assert "in standard errors" in header
+    for name, row in zip(("c", "k"), rows, strict=True):
+        shown = row.split()
+        assert shown[0] == name
+        expected = refined.params[name], refined.standard_errors[name], refined.shift[name]
+        assert [float(x) for x in shown[1:]] == pytest.approx([float(x) for x in expected], rel=0.05)
     again = Refined.from_json(refined.to_json())
     assert again.stepper == stepper
     assert again.params == refined.params

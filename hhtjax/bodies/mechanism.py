@@ -450,10 +450,9 @@ def _require_inertia(caller: str, model: Model, parts: Structure, q0: PyTree, pa
     if not _massless(numpy_mass_matrix(model, elsewhere, params)).any():
         return
     weak = _massless(numpy_mass_matrix(model, start, params))
-    names = [repr(name) for name, made in parts.joints.items() if weak[list(made.rates)].any()]
-    if names:
+    if weak.any():
         raise ValueError(
-            f"{caller}: the joint{'s' * (len(names) > 1)} {', '.join(names)} of `bodies` can move without moving a "
+            f"{caller}: {_joints_of(parts, weak)} of `bodies` can move without moving a "
             "mass, so the mass matrix is singular: give the attached bodies mass and inertia, or the joint an "
             "`armature`."
         )
@@ -462,15 +461,19 @@ def _require_inertia(caller: str, model: Model, parts: Structure, q0: PyTree, pa
 def _require_inertia_of_friction(caller: str, model: Model, parts: Structure, q0: PyTree, params: dict):
     """Raises an error that names joints with friction that move no mass. In a loop a joint may carry a body without
     mass; but friction stops a joint by its inertia."""
-    M = numpy_mass_matrix(model, jax.tree.map(np.asarray, q0), params)
-    weak = [i for i in model.rubbing if not M[i, i] > 0]
-    names = [repr(name) for name, made in parts.joints.items() if set(weak) & set(made.rates)]
-    if names:
+    weak = np.diagonal(numpy_mass_matrix(model, jax.tree.map(np.asarray, q0), params)) <= 0
+    weak = weak & np.isin(np.arange(weak.size), model.rubbing)
+    if weak.any():
         raise ValueError(
-            f"{caller}: the joint{'s' * (len(names) > 1)} {', '.join(names)} of `bodies` must move some inertia, since "
-            "friction acts there; what it carries has neither mass nor inertia. Give the joint a small `armature`, "
-            "such as 1e-5 kg m^2."
+            f"{caller}: {_joints_of(parts, weak)} of `bodies` must move some inertia, since friction acts there; what "
+            "it carries has neither mass nor inertia. Give the joint a small `armature`, such as 1e-5 kg m^2."
         )
+
+
+def _joints_of(parts: Structure, rates: np.ndarray) -> str:
+    """The joints with one of these rates, (nv,), by name."""
+    names = [repr(name) for name, made in parts.joints.items() if rates[list(made.rates)].any()]
+    return f"the joint{'s' * (len(names) > 1)} {', '.join(names)}"
 
 
 def _massless(M: np.ndarray) -> np.ndarray:

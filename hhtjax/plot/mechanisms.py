@@ -193,9 +193,10 @@ def _scene(caller: str, ax, frames: list, unit: str | None):
             panel.set(**{f"{name}lim": limits, f"{name}label": with_unit(name, unit)})
         if spatial:
             panel.set_box_aspect(size, zoom=0.8)
-            for axis, length in zip((panel.xaxis, panel.yaxis, panel.zaxis), size / max(size), strict=True):
-                few = FixedLocator([round(float(np.mean(axis.get_view_interval())), 2)])  # two labels would overlap
-                axis.set_major_locator(MaxNLocator(1 + int(5 * length)) if length > 0.2 else few)
+            axes, middles = (panel.xaxis, panel.yaxis, panel.zaxis), ((low + high) / 2).round(2) + 0.0
+            for axis, middle, length in zip(axes, middles, size / max(size), strict=True):
+                one = length <= 0.2  # two labels would overlap
+                axis.set_major_locator(FixedLocator([middle]) if one else MaxNLocator(1 + int(5 * length)))
         else:
             panel.set_aspect("equal")
             if size[0] < 0.8 * size[1]:  # narrow: more labels would overlap

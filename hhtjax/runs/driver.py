@@ -231,11 +231,13 @@ def with_flaw(failure: Failure, flaw: Array | None) -> Failure:
 def flaw_at_start(system, flat, start, params: PyTree):
     """What is wrong with the mass at the start, if it is a function; a constant mass has been checked before. With
     constraints a coordinate may have no mass, unless friction acts there."""
+    varies = callable(getattr(system, "mass", None))
     rubs = flat.friction is not None and flat.num_constraints > 0
-    if not callable(getattr(system, "mass", None)) and not rubs:
+    if not varies and not rubs:
         return None
-    M = flat.mass(start.q, start.t, params)
-    flaw = mass_flaw(M, system.constraint is not None or system.massless is not None)
+    M, flaw = flat.mass(start.q, start.t, params), jnp.zeros((), jnp.int32)
+    if varies:
+        flaw = mass_flaw(M, system.constraint is not None or system.massless is not None)
     if rubs:
         rubbed = jnp.any(directions(flat, start.q, start.t, params) != 0, axis=0)
         flaw = jnp.where((flaw == 0) & jnp.any(rubbed & (diagonal(M) <= 0)), RUBBED, flaw)
